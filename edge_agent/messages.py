@@ -292,6 +292,7 @@ class Record:
     publish_ns: int
     data: bytes
     derived: bool  # `replay --verify` compares it; refused first when the outbox fills
+    schema: str = ""  # "" = as the topic says (recording.topics.schema_of); `/raw/<port>` must name it
 
 
 @dataclass(frozen=True, slots=True)
@@ -378,8 +379,7 @@ class PointSettings:
 @dataclass(frozen=True, slots=True)
 class FusionSettings:
     """Every noise figure and limit of the filter; source: the project's numerical study unless a comment names another.
-
-    The helper that owns fusion/ extends this list; every field has its unit in its name and a reason.
+    Every field has its unit in its name and a reason.
     """
 
     start_s: float = 15.0  # window of fixed epochs before anything is emitted
@@ -390,6 +390,29 @@ class FusionSettings:
     invalid_std_vertical_m: float = 0.075
     invalid_outage_s: float = 30.0
     degraded_std_m: float = 0.005
+    coast_s: float = 3.0  # without a used fix so long, the estimate is COAST: beyond any usual interval plus latency
+    outage_s: float = 5.0  # after so long without a used fix, three must agree where the prediction cannot protect
+    lockout_s: float = 10.0  # refusals that agree on nothing may last so long, then everything is re-opened
+    accel_noise_m2ps3: float = 1e-7  # centre of the prior on q: 0.03 mg/rtHz, a good MEMS; two-sided density
+    accel_noise_decades: float = 2.0  # its sd in powers of ten: from a quartz servo to a poorly mounted sensor
+    bias_walk_m2ps5: float = 1e-9  # centre of the prior on qb: about 1 mg in an hour with temperature
+    bias_walk_decades: float = 3.0  # its sd in powers of ten: a tilting shaker needs 1e-5
+    gnss_only_q_m2ps3: float = 1e-6  # without accelerations: what velocity does by itself (wind, thermal motion)
+    gnss_only_qb_m2ps5: float = 1e-4  # and the walk of the acceleration; both are only where the bank begins
+    bank_memory_s: float = 600.0  # evidence on q, qb is forgotten over so long: temperature and traffic change
+    bank_full_s: float = 60.0  # the bank takes every fix so long after the start,
+    bank_step_s: float = 0.4  # then one in so many seconds: slow figures need no fast fixes
+    r_step: float = 0.01  # step of the median tracker on R, a fraction per fix: 10 % scatter, 23 s at 10 Hz
+    r_least: float = 0.049787068367863944  # e^-3, least factor on the declared R: a receiver is not 5 times better
+    r_most: float = 54.598150033144236  # e^4, largest factor: a receiver that claims 3 mm may have 22
+    float_std_m: float = 0.15  # a float solution wanders so much
+    float_tau_s: float = 30.0  # within so long
+    float_r_factor: float = 25.0  # and its declared R is too small by so much
+    accel_mean_s: float = 10.0  # an accelerometer gap holds the mean of so long before it
+    accel_absent_s: float = 1.0  # fixes no longer wait for an accelerometer that has been silent so long
+    accel_lost_s: float = 60.0  # after so long the point goes on as one without accelerometer
+    accel_settle_s: float = 5.0  # a new accelerometer is averaged so long before it is used
+    accel_only_std_m: float = 0.02  # points without receiver: displacement is held about zero with this sd
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,6 +425,10 @@ class RecordSettings:
     flush_s: float = 1.0  # lost at kill -9; costs 3 % of size against 10 s
     fsync_s: float = 5.0  # lost at a power cut, against the wear of the card
     view_hz: float = 25.0  # rate of the per-sample topics for plots
+    inbox_mb: float = 4.0  # ports to main; 20 s of 8 x 250 Hz; when full the newest block is dropped
+    outbox_mb: float = 16.0  # main to writer; derived records refused above 75 %, raw ones when full
+    ring_mb: float = 16.0  # records kept in memory while the disk refuses
+    accel_block: bool = False  # full-rate accelerations too; replay recomputes them from raw, so a gateway need not
 
 
 @dataclass(frozen=True, slots=True)

@@ -245,7 +245,7 @@ class DeviceClock:
         self._bin_c, self._bin_t, self._span = cs, ts, 2 * self._span
 
     def _refit(self, c_now: int) -> float:
-        """Least-squares line through the bins; move the line towards it within the slew limit, return the move in ns."""
+        """Least-squares line through the bins; move the line towards it within the slew limit; return the move, ns."""
         n = len(self._bin_c)
         if n < 2:
             return 0.0
@@ -267,7 +267,7 @@ class DeviceClock:
         here = self._t0 + (c_now - self._c0) * self.period_ns
         slew = self.SLEW if self._bin_t[-1] - self._bin_t[0] >= self.BIN_NS else self.SLEW_YOUNG
         limit = slew * max(self.period_ns, here - self._last_t) if self._last_t >= 0 else float(self.RESET_NS)
-        move = max(-limit, min(limit, target - here))
+        move = float(max(-limit, min(limit, target - here)))
         self._c0, self._t0, self.period_ns = c_now, int(round(here + move)), period
         return move
 

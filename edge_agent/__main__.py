@@ -1,0 +1,401 @@
+"""The command line, and the only place that wires things together.
+
+Exit codes: 0 good, 1 found wanting, 2 wrong use, 3 recovered with loss. Results go to stdout, talk to stderr; --json
+where a program may read the result. Each sub-command imports what it needs when it runs, so that start is light.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+GOOD, WANTING, WRONG_USE, LOSS = 0, 1, 2, 3
+NAMED_FILE = re.compile(r"([A-Za-z0-9_-]{1,32})=(.+)\Z", re.DOTALL)
+
+
+class WrongUseError(Exception):
+    """The command line asks for what cannot be done; the text says what would be right."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    args = _parser().parse_args(argv)
+    command: Callable[[argparse.Namespace], int] = args.command
+    try:
+        code = command(args)
+        sys.stdout.flush()
+        return code
+    except WrongUseError as e:
+        return _complain(str(e))
+    except BrokenPipeError:  # `edge-agent cat ... | head`: the reader has what it wanted
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return GOOD
+    except OSError as e:
+        return _complain(f"{e.filename}: {e.strerror}" if e.filename else str(e))
+    except KeyboardInterrupt:
+        return 130
+
+
+def _complain(text: str) -> int:
+    print(f"edge-agent: {text}", file=sys.stderr)
+    return WRONG_USE
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def _result(args: argparse.Namespace, value: Any, text: str) -> None:
+    """One result on stdout, as JSON where asked for."""
+    print(json.dumps(value, indent=2, ensure_ascii=False) if args.json else text)
+
+
+# ------------------------------------------------------------------------------------------------------------ commands
+
+
+def _config(args: argparse.Namespace) -> Any:
+    from edge_agent.config import ConfigError, load
+
+    try:
+        return load(args.config, getattr(args, "set", None) or ())
+    except ConfigError as e:
+        raise WrongUseError(f"{args.config} has {len(e.mistakes)} mistake(s):\n" + "\n".join(e.mistakes)) from None
+
+
+def _run(args: argparse.Namespace) -> int:
+    config = _config(args)
+    from edge_agent.runtime import run
+
+    return run(config)
+
+
+def _check(args: argparse.Namespace) -> int:
+    from edge_agent.config import ConfigError, load
+
+    try:
+        config = load(args.config, args.set or ())
+    except ConfigError as e:
+        count = f"{args.config}: {len(e.mistakes)} mistake{'' if len(e.mistakes) == 1 else 's'}"
+        _result(args, {"ok": False, "mistakes": list(e.mistakes)}, "\n".join([count, *e.mistakes]))
+        return WANTING
+    parts = {k: list(getattr(config, k)) for k in ("ports", "receivers", "accelerometers", "points")}
+    names = "; ".join(f"{k}: {', '.join(v) or 'none'}" for k, v in parts.items())
+    _result(args, {"ok": True, "mistakes": [], "site": config.site, **parts}, f"{args.config}: good; {names}")
+    return GOOD
+
+
+def _import(args: argparse.Namespace) -> int:
+    import datetime
+
+    from edge_agent.importer import MAX_NAMED, ImportRefusedError, import_logs
+
+    if not args.nmea and not args.can:
+        raise WrongUseError("import: name at least one log with --nmea or --can")
+    config = _config(args) if args.config else None
+    try:
+        date = datetime.date.fromisoformat(args.date) if args.date else None
+    except ValueError:
+        raise WrongUseError(f"--date {args.date}: write YYYY-MM-DD") from None
+    nmea = [_port_and_file(text, "gnss") for text in args.nmea]
+    can = []
+    for text in args.can:
+        port, path = _port_and_file(text, "can")
+        interface = None
+        if not path.is_file() and ":" in path.name:
+            name, _, interface = str(path).rpartition(":")
+            path = Path(name)
+        can.append((port, path, interface))
+    try:
+        done = import_logs(args.output, nmea=nmea, can=can, config=config, dbc=args.dbc, date=date)
+    except ImportRefusedError as e:
+        raise WrongUseError(f"import: {e}") from None
+    for log in done.logs:
+        for note in log.notes:
+            _say(note)
+        if log.noted > MAX_NAMED:
+            _say(f"{log.path.name}: and {log.noted - MAX_NAMED} more")
+        if log.other:
+            _say(f"{log.path.name}: {log.other} frames of other interfaces than {log.interface} left out, as asked")
+    kinds = [(log, "bytes" if i < len(nmea) else "frames") for i, log in enumerate(done.logs)]
+    seconds = (done.last_utc_ns - done.first_utc_ns) / 1e9
+    result = {
+        "output": done.path,
+        "blocks": done.raws,
+        "ticks": done.ticks,
+        "seconds": round(seconds, 3),
+        "lost": done.lost,
+        "logs": [
+            {"file": str(log.path), "port": log.port, "lines": log.lines, kind: log.items, "lost": log.lost}
+            for log, kind in kinds
+        ],
+    }
+    text = [f"{done.path}: {seconds:.1f} s in {done.raws} blocks, {done.ticks} of them ticks"]
+    text += [
+        f"  {log.port}: {log.items} {kind} of {log.lines} lines of {log.path}, {log.lost} lines lost"
+        for log, kind in kinds
+    ]
+    _result(args, result, "\n".join(text))
+    return LOSS if done.lost else GOOD
+
+
+def _port_and_file(text: str, default: str) -> tuple[str, Path]:
+    """[PORT=]FILE; a file whose own name looks like that is taken as it stands."""
+    m = NAMED_FILE.match(text)
+    if m is None or Path(text).is_file():
+        return default, Path(text)
+    return m[1], Path(m[2])
+
+
+def _replay(args: argparse.Namespace) -> int:
+    if args.set and not args.config:
+        raise WrongUseError("replay: --set needs -c: an override changes a configuration")
+    if args.output is None and not args.verify:
+        raise WrongUseError("replay: give -o OUT for a new recording, --verify to compare, or both")
+    config = _config(args) if args.config else None
+    from edge_agent.config import ConfigError
+    from edge_agent.recording.reader import DamagedError
+    from edge_agent.replay import ReplayError, replay
+
+    try:
+        report = replay(args.inputs, args.output, config, args.verify)
+    except (ReplayError, ConfigError) as e:
+        raise WrongUseError(f"replay: {e}") from None
+    except DamagedError as e:
+        _say(f"edge-agent: replay: {e}")
+        return WANTING
+    _result(args, {"ok": report.ok, **dataclasses.asdict(report)}, str(report))
+    return GOOD if report.ok else WANTING
+
+
+def _info(args: argparse.Namespace) -> int:
+    from edge_agent.cat import describe, describe_text
+
+    try:
+        files, wanting = describe(args.files)
+    except ValueError as e:
+        raise WrongUseError(f"info: {e}") from None
+    _result(args, files, describe_text(files))
+    return WANTING if wanting else GOOD
+
+
+def _cat(args: argparse.Namespace) -> int:
+    from edge_agent import cat
+
+    try:
+        begin = None if args.begin is None else cat.parse_time(args.begin)
+        end = None if args.end is None else cat.parse_time(args.end)
+    except ValueError as e:
+        raise WrongUseError(f"cat: {e}") from None
+    if args.format == "csv" and len(args.topic) != 1:
+        try:
+            there = "\n".join(f"  {t}" for t in cat.topics_of(args.files))
+        except ValueError as e:
+            raise WrongUseError(f"cat: {e}") from None
+        raise WrongUseError(
+            f"cat: CSV holds one topic; name it with --topic, or take --format jsonl. There are:\n{there}"
+        )
+    table = cat.rows(args.files, args.topic, begin, end)
+    try:
+        n = (cat.write_csv if args.format == "csv" else cat.write_jsonl)(sys.stdout, table)
+    except ValueError as e:
+        _say(f"edge-agent: cat: {e}")
+        return WANTING
+    if n == 0:
+        _say("cat: nothing of that topic and time; `edge-agent info` lists what there is")
+        return WANTING
+    return GOOD
+
+
+def _recover(args: argparse.Namespace) -> int:
+    from edge_agent.recording.repair import recover, repair
+
+    done = []
+    for path in args.paths:
+        if not path.is_dir() and not path.name.endswith(".mcap.part"):
+            raise WrongUseError(f"recover: {path} is neither a folder nor a torn recording (*.mcap.part)")
+        done += recover(path) if path.is_dir() else [repair(path)]
+    result = [
+        {"file": str(r.path), "what": r.what, "messages": r.messages, "lost_bytes": r.lost_bytes, "detail": r.detail}
+        for r in done
+    ]
+    lines = [
+        f"{r['file']}: {r['what']}, {r['messages']} messages kept, {r['lost_bytes']} bytes lost"
+        + (f" ({r['detail']})" if r["detail"] else "")
+        for r in result
+    ]
+    _result(args, result, "\n".join(lines) or "nothing to recover")
+    if any(r.what == "failed" for r in done):
+        return WANTING
+    return LOSS if any(r.lost_bytes for r in done) else GOOD
+
+
+def _simulate(args: argparse.Namespace) -> int:
+    from edge_agent.simulate import SCENARIOS, simulate
+    from edge_agent.simulate.files import write_files
+
+    if args.scenario not in SCENARIOS:
+        raise WrongUseError(f"simulate: no scenario {args.scenario!r}; there are: {', '.join(SCENARIOS)}")
+    for path in write_files(simulate(args.scenario, args.seed, args.seconds), args.output):
+        print(path)
+    return GOOD
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from edge_agent.demo import run_demo
+
+    return run_demo(args.output, args.seconds, args.seed)
+
+
+# -------------------------------------------------------------------------------------------------------------- parser
+
+
+class _Version(argparse.Action):
+    """--version, read from the installed package only when asked for."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str) -> None:
+        super().__init__(option_strings, dest, nargs=0, help="print the version and exit")
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from importlib.metadata import version
+
+        print(f"edge-agent {version('edge-agent')}")
+        parser.exit()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="edge-agent",
+        description="Fuses RTK GNSS and accelerometers on a gateway and records everything.",
+        epilog="Exit codes: 0 good, 1 found wanting, 2 wrong use, 3 recovered with loss. "
+        "`edge-agent COMMAND --help` shows an example of each.",
+    )
+    parser.add_argument("--version", action=_Version)
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    def add(
+        name: str, command: Callable[[argparse.Namespace], int], about: str, example: str
+    ) -> argparse.ArgumentParser:
+        p = commands.add_parser(
+            name,
+            help=about,
+            description=about[0].upper() + about[1:] + ".",
+            epilog=f"example:\n  {example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        p.set_defaults(command=command)
+        return p
+
+    def json_flag(p: argparse.ArgumentParser) -> None:
+        p.add_argument("--json", action="store_true", help="the result as JSON")
+
+    def config_flag(p: argparse.ArgumentParser, required: bool) -> None:
+        p.add_argument("-c", "--config", type=Path, required=required, metavar="CONFIG", help="the YAML configuration")
+
+    def set_flag(p: argparse.ArgumentParser) -> None:
+        p.add_argument(
+            "--set",
+            action="append",
+            default=[],
+            metavar="PATH=VALUE",
+            help="override one key, e.g. fusion.gate_alpha=0.01",
+        )
+
+    p = add("run", _run, "the service: read the ports, fuse, record, until SIGTERM", "edge-agent run -c site.yaml")
+    config_flag(p, required=True)
+
+    p = add("check", _check, "check a configuration: every mistake with its path", "edge-agent check -c site.yaml")
+    config_flag(p, required=True)
+    set_flag(p)
+    json_flag(p)
+
+    p = add(
+        "import",
+        _import,
+        "logs of others (NMEA, mixed binary, candump -l) to a raw recording",
+        "edge-agent import -c site.yaml --nmea gps=rover.nmea --can can0=candump.log:can1 -o raw.mcap",
+    )
+    config_flag(p, required=False)
+    p.add_argument(
+        "--nmea", action="append", default=[], metavar="[PORT=]FILE", help="NMEA capture; PORT is gnss if unset"
+    )
+    p.add_argument(
+        "--can",
+        action="append",
+        default=[],
+        metavar="[PORT=]FILE[:IFACE]",
+        help="candump -l log; PORT is can if unset; without IFACE every interface goes to that port",
+    )
+    p.add_argument("--dbc", action="append", default=[], type=Path, metavar="FILE", help="attach a DBC file")
+    p.add_argument("--date", metavar="YYYY-MM-DD", help="day of the first sentence, where the sentences carry none")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.mcap")
+    json_flag(p)
+
+    p = add(
+        "replay",
+        _replay,
+        "run recordings through the same data path again; verify or retune",
+        "edge-agent replay --verify rec/*.mcap\n"
+        "  edge-agent replay raw.mcap -c site.yaml --set fusion.gate_alpha=0.01 -o new.mcap",
+    )
+    p.add_argument("inputs", nargs="+", type=Path, metavar="IN")
+    p.add_argument("-o", "--output", type=Path, metavar="OUT")
+    config_flag(p, required=False)
+    set_flag(p)
+    p.add_argument(
+        "--verify", action="store_true", help="compare every derived record with the recorded one, byte for byte"
+    )
+    json_flag(p)
+
+    p = add("info", _info, "what recordings hold: times, topics, rates, run, continuity", "edge-agent info rec/*.mcap")
+    p.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    json_flag(p)
+
+    p = add(
+        "cat",
+        _cat,
+        "any topic as CSV or JSON lines, with units, blocks as samples",
+        "edge-agent cat --topic /fusion/mid/block rec/*.mcap > mid.csv",
+    )
+    p.add_argument("files", nargs="+", type=Path, metavar="FILE", help="taken in the order given")
+    p.add_argument(
+        "--topic", action="append", default=[], help="CSV: one; JSON lines: any number, all if none is named"
+    )
+    p.add_argument("--from", dest="begin", metavar="TIME", help="UTC, ISO or seconds since 1970; inclusive")
+    p.add_argument("--to", dest="end", metavar="TIME", help="exclusive")
+    p.add_argument("--format", choices=("csv", "jsonl"), default="csv")
+
+    p = add(
+        "recover", _recover, "make torn recordings (*.part) readable; nothing is deleted", "edge-agent recover rec/"
+    )
+    p.add_argument("paths", nargs="+", type=Path, metavar="FOLDER|FILE")
+    json_flag(p)
+
+    p = add(
+        "simulate",
+        _simulate,
+        "a structure with sensors and faults of exactly known truth, as files",
+        "edge-agent simulate hostile --seed 7 -o sim/",
+    )
+    p.add_argument("scenario", metavar="SCENARIO")
+    p.add_argument("--seed", type=int, default=1, metavar="N", help="the same seed gives the same files")
+    p.add_argument("--seconds", type=float, help="as the scenario says if unset")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+
+    p = add(
+        "demo", _demo, "a simulated bridge plays through real ports into the live agent", "edge-agent demo -o demo-out"
+    )
+    p.add_argument("-o", "--output", type=Path, default=Path("demo-out"), metavar="DIR")
+    p.add_argument("--seconds", type=float, default=60.0)
+    p.add_argument("--seed", type=int, default=1)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

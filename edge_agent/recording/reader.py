@@ -1,0 +1,383 @@
+"""Recordings read back, in the order of the file: replay needs exactly that order, and a torn tail must not stop it.
+
+The walk is over records, not over the summary, so a file without its footer reads like a whole one up to its last whole
+chunk. Every chunk's CRC is checked (libraries do not by default). A tail that was cut ends the walk in silence; damage
+with more of the file behind it raises DamagedError, for what follows would be out of its context.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from collections.abc import Container, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+
+import zstandard
+
+from edge_agent.recording import topics
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 1, 2, 3, 4, 5, 6, 7
+ATTACHMENT, METADATA, DATA_END = 9, 12, 15
+CHUNK_MAX = 1 << 30
+"""No chunk that this program or a sane one writes is larger unpacked; a damaged length must not fill the memory."""
+
+Buffer: TypeAlias = bytes | mmap.mmap
+
+_RECORD = struct.Struct("<BQ")
+_CHUNK = struct.Struct("<QQQII")
+_MESSAGE = struct.Struct("<HIQQ")
+_U16 = struct.Struct("<H")
+_U32 = struct.Struct("<I")
+_U64 = struct.Struct("<Q")
+
+
+class DamagedError(ValueError):
+    """A file that is not as it was written, and not merely cut at its end."""
+
+
+class Stored(NamedTuple):
+    """One message of a file. Times are UTC ns."""
+
+    topic: str
+    schema: str
+    log_ns: int
+    publish_ns: int
+    sequence: int
+    data: bytes
+
+
+class Part(NamedTuple):
+    """One record of a file: its opcode, and the position and length of its content."""
+
+    opcode: int
+    pos: int
+    length: int
+
+
+class ChunkHead(NamedTuple):
+    start_ns: int
+    end_ns: int
+    size: int  # unpacked
+    crc: int
+    compression: str
+    pos: int  # of the packed data
+    length: int
+
+
+@contextmanager
+def view(path: Path) -> Iterator[Buffer]:
+    """The file's bytes without reading them all. OSError as open."""
+    with open(path, "rb") as file:
+        if file.seek(0, 2) == 0:  # nothing to map
+            yield b""
+            return
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as buffer:
+            yield buffer
+
+
+def parts(buffer: Buffer, pos: int = len(MAGIC)) -> Iterator[Part]:
+    """Whole records from `pos` on, to the footer or the first that is cut or no record (opcode 0: unwritten space)."""
+    end = len(buffer)
+    while pos + _RECORD.size <= end:
+        opcode, length = _RECORD.unpack_from(buffer, pos)
+        pos += _RECORD.size
+        if opcode == 0 or length > end - pos:
+            return
+        yield Part(opcode, pos, length)
+        if opcode == FOOTER:
+            return
+        pos += length
+
+
+def chunk_head(buffer: Buffer, part: Part) -> ChunkHead:
+    """Head of a chunk record. DamagedError where it does not hold together."""
+    fixed = _CHUNK.size
+    if part.length < fixed + 8:
+        raise DamagedError(f"chunk at byte {part.pos}: too short")
+    start, end, size, crc, name = _CHUNK.unpack_from(buffer, part.pos)
+    if name > part.length - fixed - 8:
+        raise DamagedError(f"chunk at byte {part.pos}: damaged head")
+    pos = part.pos + fixed + name
+    (length,) = _U64.unpack_from(buffer, pos)
+    if length != part.length - fixed - name - 8 or size > CHUNK_MAX or start > end:
+        raise DamagedError(f"chunk at byte {part.pos}: damaged head")
+    compression = buffer[part.pos + fixed : pos].decode("ascii", "replace")
+    return ChunkHead(start, end, size, crc, compression, pos + 8, length)
+
+
+def chunk_data(buffer: Buffer, head: ChunkHead) -> bytes:
+    """A chunk's records, unpacked and checked by its CRC. DamagedError where that fails."""
+    packed = buffer[head.pos : head.pos + head.length]
+    if head.compression == "":
+        data = packed
+    elif head.compression == "zstd":
+        try:
+            declared = zstandard.get_frame_parameters(packed).content_size
+            if declared not in (head.size, zstandard.CONTENTSIZE_UNKNOWN):
+                raise DamagedError(f"chunk at byte {head.pos}: damaged data (size)")
+            data = zstandard.decompress(packed, max_output_size=head.size)
+        except zstandard.ZstdError as e:
+            raise DamagedError(f"chunk at byte {head.pos}: damaged data ({e})") from None
+    else:
+        raise DamagedError(f"chunk at byte {head.pos}: compression {head.compression!r} is not supported")
+    if len(data) != head.size or (head.crc and zlib.crc32(data) != head.crc):
+        raise DamagedError(f"chunk at byte {head.pos}: damaged data (CRC)")
+    return data
+
+
+def _text(buffer: Buffer, pos: int, end: int) -> tuple[str, int]:
+    """A string at pos and the position behind it."""
+    if pos + 4 > end:
+        raise DamagedError(f"string at byte {pos}: cut")
+    (n,) = _U32.unpack_from(buffer, pos)
+    pos += 4
+    if n > end - pos:
+        raise DamagedError(f"string at byte {pos}: damaged length")
+    try:
+        return buffer[pos : pos + n].decode(), pos + n
+    except UnicodeDecodeError:  # other readers stop at it, so it must not get into a repaired file
+        raise DamagedError(f"string at byte {pos}: damaged text") from None
+
+
+def _numbers(layout: struct.Struct, buffer: Buffer, pos: int, end: int) -> tuple[int, ...]:
+    if pos + layout.size > end:
+        raise DamagedError(f"record at byte {pos}: cut")
+    return layout.unpack_from(buffer, pos)
+
+
+@dataclass
+class Channels:
+    """The schemas and channels that a walk has met so far."""
+
+    schemas: dict[int, tuple[str, bytes]] = field(default_factory=dict)  # id -> name, text
+    channels: dict[int, tuple[str, int]] = field(default_factory=dict)  # id -> topic, schema id
+    records: dict[tuple[int, int], bytes] = field(default_factory=dict)  # opcode, id -> the record as it stands
+
+    def meet(self, buffer: Buffer, part: Part) -> None:
+        """Take a schema or channel record. DamagedError where it does not hold together."""
+        end = part.pos + part.length
+        (number,) = _numbers(_U16, buffer, part.pos, end)
+        if part.opcode == SCHEMA:
+            name, pos = _text(buffer, part.pos + 2, end)
+            _, pos = _text(buffer, pos, end)  # encoding
+            (n,) = _numbers(_U32, buffer, pos, end)
+            if pos + 4 + n != end:
+                raise DamagedError(f"schema at byte {part.pos}: damaged length")
+            self.schemas[number] = name, buffer[pos + 4 : end]
+        else:
+            (schema,) = _numbers(_U16, buffer, part.pos + 2, end)
+            topic, pos = _text(buffer, part.pos + 4, end)
+            _text(buffer, pos, end)  # encoding
+            self.channels[number] = topic, schema
+        self.records[part.opcode, number] = buffer[part.pos - _RECORD.size : end]
+
+    def message(self, buffer: Buffer, part: Part) -> Stored:
+        """A message record. DamagedError without its channel."""
+        end = part.pos + part.length
+        channel, sequence, log_ns, publish_ns = _numbers(_MESSAGE, buffer, part.pos, end)
+        try:
+            topic, schema = self.channels[channel]
+            name = self.schemas[schema][0] if schema else ""
+        except KeyError:
+            raise DamagedError(f"message at byte {part.pos}: its channel {channel} is not in the file") from None
+        return Stored(topic, name, log_ns, publish_ns, sequence, buffer[part.pos + _MESSAGE.size : end])
+
+
+def _check_magic(buffer: Buffer, path: Path) -> None:
+    if buffer[: len(MAGIC)] != MAGIC:
+        raise DamagedError(f"{path}: not an MCAP file")
+
+
+def read_messages(path: Path, wanted: Container[str] | None = None) -> Iterator[Stored]:
+    """Messages of the topics `wanted` (None = all) in the order of the file.
+
+    Raises OSError, DamagedError for a file that is no MCAP or is damaged before its tail. A file that is being written
+    gives what was flushed when it was opened.
+    """
+    with view(Path(path)) as buffer:
+        _check_magic(buffer, path)
+        yield from _messages(buffer, Channels(), wanted)
+
+
+def _messages(buffer: Buffer, known: Channels, wanted: Container[str] | None) -> Iterator[Stored]:
+    for part in parts(buffer):
+        if part.opcode == CHUNK:
+            try:
+                data = chunk_data(buffer, chunk_head(buffer, part))
+            except DamagedError:
+                if next(parts(buffer, part.pos + part.length), None) is None:  # the last thing written: a torn tail
+                    return
+                raise
+            inner = 0
+            for inner_part in parts(data, 0):
+                inner = inner_part.pos + inner_part.length
+                if inner_part.opcode == MESSAGE:
+                    stored = known.message(data, inner_part)
+                    if wanted is None or stored.topic in wanted:
+                        yield stored
+                elif inner_part.opcode in (SCHEMA, CHANNEL):
+                    known.meet(data, inner_part)
+            if inner != len(data):
+                raise DamagedError(f"chunk at byte {part.pos}: its records do not fill it")
+        elif part.opcode == MESSAGE:
+            stored = known.message(buffer, part)
+            if wanted is None or stored.topic in wanted:
+                yield stored
+        elif part.opcode in (SCHEMA, CHANNEL):
+            known.meet(buffer, part)
+        elif part.opcode == DATA_END:
+            return
+
+
+class Attachment(NamedTuple):
+    name: str
+    media_type: str
+    data: bytes
+
+
+def read_attachments(path: Path) -> list[Attachment]:
+    """Attached files. Raises OSError, DamagedError (CRC)."""
+    with view(Path(path)) as buffer:
+        _check_magic(buffer, path)
+        return [parse_attachment(buffer, part) for part in parts(buffer) if part.opcode == ATTACHMENT]
+
+
+def parse_attachment(buffer: Buffer, part: Part) -> Attachment:
+    """An attachment record: two times, name, media type, data, CRC."""
+    end = part.pos + part.length
+    name, pos = _text(buffer, part.pos + 16, end)
+    media_type, pos = _text(buffer, pos, end)
+    (n,) = _numbers(_U64, buffer, pos, end)
+    pos += 8
+    if pos + n + 4 != end:
+        raise DamagedError(f"attachment at byte {part.pos}: damaged length")
+    (crc,) = _numbers(_U32, buffer, pos + n, end)
+    if crc and zlib.crc32(buffer[part.pos : pos + n]) != crc:
+        raise DamagedError(f"attachment {name!r} at byte {part.pos}: damaged data (CRC)")
+    return Attachment(name, media_type, buffer[pos : pos + n])
+
+
+def read_metadata(path: Path) -> dict[str, dict[str, str]]:
+    """Metadata records by name; of one name, the last. Raises OSError, DamagedError."""
+    with view(Path(path)) as buffer:
+        _check_magic(buffer, path)
+        found = [parse_metadata(buffer, part) for part in parts(buffer) if part.opcode == METADATA]
+    return dict(found)
+
+
+def parse_metadata(buffer: Buffer, part: Part) -> tuple[str, dict[str, str]]:
+    """A metadata record: its name and its strings."""
+    end = part.pos + part.length
+    name, pos = _text(buffer, part.pos, end)
+    (n,) = _numbers(_U32, buffer, pos, end)
+    pos += 4
+    if pos + n != end:
+        raise DamagedError(f"metadata {name!r} at byte {part.pos}: damaged length")
+    values: dict[str, str] = {}
+    while pos < end:
+        key, pos = _text(buffer, pos, end)
+        values[key], pos = _text(buffer, pos, end)
+    return name, values
+
+
+def parse_header(buffer: Buffer, part: Part) -> tuple[str, str]:
+    """Profile and library of a header record."""
+    end = part.pos + part.length
+    profile, pos = _text(buffer, part.pos, end)
+    library, _ = _text(buffer, pos, end)
+    return profile, library
+
+
+@dataclass
+class TopicInfo:
+    """What a file holds of one topic. `longest_ns`: the longest time between two of its messages, by log time."""
+
+    schema: str
+    count: int = 0
+    size: int = 0  # bytes of its messages, unpacked
+    first_ns: int = 0
+    last_ns: int = 0
+    longest_ns: int = 0
+
+
+class Gap(NamedTuple):
+    """Raw blocks that are missing: the order jumps from `after` to `before` at `log_ns`."""
+
+    after: int
+    before: int
+    log_ns: int
+
+
+@dataclass
+class Info:
+    """Summary of a file, from a walk through all of it."""
+
+    path: Path
+    size: int
+    complete: bool = False  # index and footer are there
+    damage: str = ""  # "" = every chunk is as it was written
+    profile: str = ""
+    library: str = ""
+    chunks: int = 0
+    messages: int = 0
+    start_ns: int = 0  # UTC, smallest and largest log time
+    end_ns: int = 0
+    topics: dict[str, TopicInfo] = field(default_factory=dict)
+    schemas: dict[str, str] = field(default_factory=dict)  # name -> message text
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: list[tuple[str, str, int]] = field(default_factory=list)  # name, media type, bytes
+    gaps: list[Gap] = field(default_factory=list)
+
+
+def info(path: Path) -> Info:
+    """Walk through the whole file. Raises OSError, DamagedError for what is no MCAP; other damage is in `damage`."""
+    path = Path(path)
+    with view(path) as buffer:
+        _check_magic(buffer, path)
+        result = Info(path, len(buffer))
+        known = Channels()
+        last_order: int | None = None
+        try:
+            for part in parts(buffer):
+                if part.opcode == HEADER:
+                    result.profile, result.library = parse_header(buffer, part)
+                elif part.opcode == CHUNK:
+                    result.chunks += 1
+                elif part.opcode == ATTACHMENT:
+                    name, media_type, data = parse_attachment(buffer, part)
+                    result.attachments.append((name, media_type, len(data)))
+                elif part.opcode == METADATA:
+                    name, values = parse_metadata(buffer, part)
+                    result.metadata[name] = values
+                elif part.opcode == FOOTER:
+                    result.complete = buffer[part.pos + part.length :] == MAGIC
+            for stored in _messages(buffer, known, None):
+                _count(result, stored)
+                if stored.topic.startswith(topics.RAW_PREFIX) and stored.topic != topics.CHECKPOINT_TOPIC:
+                    order = topics.raw_order(stored.schema, stored.data)
+                    if last_order is not None and order != last_order + 1:
+                        result.gaps.append(Gap(last_order, order, stored.log_ns))
+                    last_order = order
+        except ValueError as e:
+            result.damage = str(e)
+        result.schemas = {name: text.decode("utf-8", "replace") for name, text in known.schemas.values()}
+    return result
+
+
+def _count(result: Info, stored: Stored) -> None:
+    first = result.messages == 0
+    result.messages += 1
+    result.start_ns = stored.log_ns if first else min(result.start_ns, stored.log_ns)
+    result.end_ns = max(result.end_ns, stored.log_ns)
+    topic = result.topics.get(stored.topic)
+    if topic is None:
+        topic = result.topics[stored.topic] = TopicInfo(stored.schema, first_ns=stored.log_ns, last_ns=stored.log_ns)
+    topic.count += 1
+    topic.size += len(stored.data)
+    topic.longest_ns = max(topic.longest_ns, stored.log_ns - topic.last_ns)
+    topic.last_ns = stored.log_ns

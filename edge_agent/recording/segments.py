@@ -1,0 +1,293 @@
+"""Segments: which file is written, what it is called, when it is on the disk, and which old ones go.
+
+A `Rotate` closes the open segment and opens the next, whose first record is the Rotate's checkpoint; nothing else
+opens or closes one. Names are `<site>_<YYYYMMDDTHHMMSSZ>_<NNN>.mcap`, with `.part` behind while the file is open; NNN
+counts files of one second, so no two files ever share a name. Each file's metadata names the file before it and that
+file's SHA-256. Retention looks only at names of this form and this site: older than `keep_days`, more than `keep_gb`
+together, less than `free_gb` free; it never touches the open file.
+
+One thread drives a Recorder; time is an argument (monotonic ns). When the disk fails, the open file is sealed as far as
+it goes and RecordingError is raised; the Recorder then has no open file until the next Rotate.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import re
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import NamedTuple
+
+from edge_agent.messages import Fault, Record, RecordSettings, Rotate, S
+from edge_agent.recording.repair import DAMAGED, Repaired, recover, repair
+from edge_agent.recording.writer import PART, SegmentWriter, fsync_folder
+
+__all__ = ["Recorder", "RecordingError", "Repaired", "Segment", "list_segments", "recover"]
+
+GB = 1e9
+PLAUSIBLE = datetime(2020, 1, 1, tzinfo=UTC)
+"""Names before this come from a gateway whose clock had not been set; their age is not known."""
+HEAD_BYTES = 1 << 20
+"""Free space without which no file is begun: head, checkpoint and an index."""
+RETENTION_NS = 60 * S
+"""How often retention looks at the folder while a file is open: other programs fill disks too."""
+
+_NAME = r"_(\d{8}T\d{6}Z)_(\d{3,})\.mcap"
+
+
+class RecordingError(Exception):
+    """The disk refused. `reason`: "full", "read-only", "io" or "closed"; `unwritten`: records that are in no file.
+    Recording goes on if the Recorder's `path` is not None, else it waits for the next Rotate."""
+
+    def __init__(self, reason: str, text: str, unwritten: tuple[Record, ...] = ()) -> None:
+        super().__init__(text)
+        self.reason = reason
+        self.unwritten = unwritten
+
+
+class Segment(NamedTuple):
+    """A finished file of a site, or the damaged original of one. Sorts oldest first."""
+
+    begin: datetime  # of the name, UTC
+    number: int
+    path: Path
+    size: int
+
+
+def list_segments(data_dir: Path, site: str) -> list[Segment]:
+    """Finished files of a site, oldest first; anything with another form of name is not seen."""
+    form = re.compile(re.escape(site) + _NAME + rf"(?:{re.escape(DAMAGED)}\d*)?", re.ASCII)
+    found = []
+    for path in data_dir.iterdir():
+        match = form.fullmatch(path.name)
+        if match is None:
+            continue
+        try:
+            begin = datetime.strptime(match[1], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+            found.append(Segment(begin, int(match[2]), path, path.stat().st_size))
+        except (ValueError, FileNotFoundError):  # no date, or taken away by someone meanwhile
+            continue
+    return sorted(found)
+
+
+class Recorder:
+    """Writes one run's segments into `data_dir` (made if missing).
+
+    `metadata` and `attachments` go into every file; `free_bytes()` tells the free space of the file system.
+    """
+
+    def __init__(
+        self,
+        data_dir: Path,
+        settings: RecordSettings,
+        site: str,
+        metadata: Mapping[str, str],
+        attachments: Mapping[str, bytes],
+        free_bytes: Callable[[], int],
+    ) -> None:
+        self.data_dir = Path(data_dir)
+        self.settings = settings
+        self.site = site
+        self.metadata = dict(metadata)
+        self.attachments = dict(attachments)
+        self.free_bytes = free_bytes
+        self.segments = 0  # opened by this run
+        self._writer: SegmentWriter | None = None
+        self._previous: tuple[str, str] | None = None  # name and SHA-256 of the file before; ("", "") = none
+        self._faults: list[Fault] = []
+        self._now_ns = 0
+        self._utc = PLAUSIBLE
+        self._flushed_ns = self._synced_ns = self._pruned_ns = 0
+
+    @property
+    def path(self) -> Path | None:
+        """The open file."""
+        return None if self._writer is None else self._writer.path
+
+    @property
+    def open_bytes(self) -> int:
+        """Size of the open file, without what waits in its open chunk; 0 = no file is open."""
+        return 0 if self._writer is None else self._writer.size
+
+    def drain_faults(self) -> list[Fault]:
+        """What happened since the last call: files deleted by retention."""
+        faults, self._faults = self._faults, []
+        return faults
+
+    def handle(self, item: Record | Rotate, now_ns: int | None = None) -> None:
+        """Write a record, or begin a new segment. Raises RecordingError (disk), ValueError or TypeError for a record
+        that the format cannot hold; a Record while no file is open is a RecordingError that returns it."""
+        if now_ns is not None:
+            self._now_ns = now_ns
+        if isinstance(item, Rotate):
+            self._rotate(item)
+            return
+        if self._writer is None:
+            raise RecordingError("closed", "no segment is open", (item,))
+        try:
+            self._writer.add(item)
+        except OSError as e:
+            raise self._fail(e) from e
+
+    def idle(self, now_ns: int) -> None:
+        """Do what is due: flush every `flush_s`, fsync every `fsync_s`, retention every minute. RecordingError."""
+        self._now_ns = now_ns
+        writer = self._writer
+        if writer is None:
+            return
+        try:
+            if now_ns - self._synced_ns >= self.settings.fsync_s * S:
+                writer.fsync()
+                self._synced_ns = self._flushed_ns = now_ns
+            elif now_ns - self._flushed_ns >= self.settings.flush_s * S:
+                writer.flush()
+                self._flushed_ns = now_ns
+        except OSError as e:
+            raise self._fail(e) from e
+        if now_ns - self._pruned_ns >= RETENTION_NS:
+            try:
+                self._retain()
+            except OSError as e:  # the folder cannot be read; whether it can be written shows at the next record
+                self._faults.append(Fault(now_ns, "recorder", "RETENTION_FAILED", f"{self.data_dir}: {e}"))
+
+    def close(self) -> Path | None:
+        """Finish the open segment; return its final path. RecordingError."""
+        writer = self._writer
+        if writer is None:
+            return None
+        try:
+            final = writer.close()
+        except OSError as e:
+            raise self._fail(e) from e
+        self._writer = None
+        self._previous = final.name, writer.sha256
+        return final
+
+    # ------------------------------------------------------------------------------------------------------- segments
+
+    def _rotate(self, rotate: Rotate) -> None:
+        unfinished: RecordingError | None = None
+        try:
+            self.close()
+        except RecordingError as e:  # the next segment is tried all the same; the loss is told behind
+            unfinished = e
+        lost = unfinished.unwritten if unfinished else ()
+        self._utc = datetime.fromtimestamp(rotate.utc_ns // S, UTC)
+        try:
+            self.data_dir.mkdir(parents=True, exist_ok=True)
+            self._retain()
+            self._writer = self._open(rotate)
+        except OSError as e:
+            text = f"no segment can be opened: {e}"
+            raise RecordingError(_reason(e), text, (*lost, rotate.checkpoint)) from e
+        self.segments += 1
+        self._flushed_ns = self._synced_ns = self._now_ns
+        if unfinished:
+            raise RecordingError(unfinished.reason, f"{unfinished}; a new segment is open", lost) from unfinished
+
+    def _open(self, rotate: Rotate) -> SegmentWriter:
+        """A new file with its head and checkpoint on the disk; on an OSError nothing of it is left."""
+        if self.free_bytes() < HEAD_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.data_dir))
+        if self._previous is None:
+            self._previous = self._last_on_disk()
+        name, sha256 = self._previous
+        path = self._free_name()
+        metadata = {
+            **self.metadata,
+            "site": self.site,
+            "segment": str(self.segments),
+            "opened_because": rotate.reason,
+            "previous_name": name,
+            "previous_sha256": sha256,
+        }
+        writer = SegmentWriter(path, metadata=metadata, attachments=self.attachments, utc_ns=max(rotate.utc_ns, 0))
+        try:
+            writer.add(rotate.checkpoint)
+            writer.fsync()  # schemas and channels of the first chunk are what makes the rest readable
+            fsync_folder(self.data_dir)
+        except OSError:
+            writer.abandon()
+            with suppress(OSError):
+                path.unlink()  # holds nothing but a head; tries to record on a full disk must not pile up
+            raise
+        return writer
+
+    def _free_name(self) -> Path:
+        stem = f"{self.site}_{self._utc:%Y%m%dT%H%M%SZ}"
+        taken = [path.name for path in self.data_dir.iterdir()]
+        number = 0
+        while any(name.startswith(f"{stem}_{number:03d}.mcap") for name in taken):
+            number += 1
+        return self.data_dir / f"{stem}_{number:03d}.mcap{PART}"
+
+    def _last_on_disk(self) -> tuple[str, str]:
+        """The newest file of the run before, and its hash: the chain goes on over a restart."""
+        finished = [s for s in list_segments(self.data_dir, self.site) if s.path.suffix == ".mcap"]
+        if not finished:
+            return "", ""
+        with open(finished[-1].path, "rb") as file:
+            return finished[-1].path.name, hashlib.file_digest(file, "sha256").hexdigest()
+
+    # ------------------------------------------------------------------------------------------------------ retention
+
+    def _retain(self) -> None:
+        """Delete what is too old, then the oldest while there is too much or too little space is free."""
+        self._pruned_ns = self._now_ns
+        segments = list_segments(self.data_dir, self.site)
+        keep = timedelta(days=self.settings.keep_days)
+        if self._utc >= PLAUSIBLE:
+            for segment in list(segments):
+                if PLAUSIBLE <= segment.begin < self._utc - keep:
+                    self._delete(segment, f"older than {self.settings.keep_days:g} days")
+                    segments.remove(segment)
+        total = sum(segment.size for segment in segments) + self.open_bytes
+        while segments and total > self.settings.keep_gb * GB:
+            segment = segments.pop(0)
+            self._delete(segment, f"more than {self.settings.keep_gb:g} GB of recordings")
+            total -= segment.size
+        while segments and self.free_bytes() < self.settings.free_gb * GB:
+            self._delete(segments.pop(0), f"less than {self.settings.free_gb:g} GB free")
+
+    def _delete(self, segment: Segment, why: str) -> None:
+        try:
+            segment.path.unlink()
+        except OSError as e:
+            self._tell("RETENTION_FAILED", f"{segment.path.name} cannot be deleted: {e.strerror or e}", segment)
+        else:
+            self._tell("RETENTION", f"{segment.path.name} deleted: {why}", segment)
+
+    def _tell(self, kind: str, text: str, segment: Segment) -> None:
+        self._faults.append(Fault(self._now_ns, "recorder", kind, text, (("bytes", float(segment.size)),)))
+
+    # ---------------------------------------------------------------------------------------------------- disk errors
+
+    def _fail(self, error: OSError) -> RecordingError:
+        """Let go of the open file, seal it as far as it goes, and make the error that the caller raises."""
+        writer, self._writer = self._writer, None
+        unwritten: tuple[Record, ...] = ()
+        sealed = ""
+        if writer is not None:
+            unwritten = writer.pending
+            writer.abandon()
+            self._previous = None  # its hash is not that of what was written
+            sealed = self._seal(writer.path, error.errno == errno.ENOSPC)
+        return RecordingError(_reason(error), f"recording stopped: {error}; {sealed}", unwritten)
+
+    def _seal(self, part: Path, full: bool) -> str:
+        try:
+            if full:  # the index needs some kilobytes: the oldest segment makes room for them
+                segments = list_segments(self.data_dir, self.site)
+                if segments:
+                    self._delete(segments[0], "the disk is full")
+            return f"{repair(part).path.name} was sealed"
+        except OSError as e:
+            return f"{part.name} waits for repair ({e.strerror or e})"
+
+
+def _reason(error: OSError) -> str:
+    return {errno.ENOSPC: "full", errno.EDQUOT: "full", errno.EROFS: "read-only"}.get(error.errno or 0, "io")
