@@ -621,7 +621,7 @@ def _check_receivers(tables: Mapping[str, Mapping[str, Any]], report: _Report) -
 
 
 def _check_accelerometers(
-    tables: Mapping[str, Mapping[str, Any]], read_file: Callable[[str], bytes], files: dict[str, bytes], report: _Report
+    tables: dict[str, dict[str, Any]], read_file: Callable[[str], bytes], files: dict[str, bytes], report: _Report
 ) -> None:
     listening: list[tuple[AccelerometerSettings, Any]] = []
     for name, accel in tables["accelerometers"].items():
@@ -659,7 +659,7 @@ def _check_accelerometers(
             accel = dataclasses.replace(accel, rotation=AccelerometerSettings(name, "").rotation)
         if accel.dbc is not None:
             accel = dataclasses.replace(accel, dbc_text=_dbc_text(files[accel.dbc]))
-            tables["accelerometers"][name] = accel  # type: ignore[index]
+            tables["accelerometers"][name] = accel
         codec = _codec(accel, path, report)
         if codec is not None:
             listening.append((accel, codec))

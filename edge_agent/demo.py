@@ -427,7 +427,7 @@ def draw(path: Path, seen: Seen, record: SimRecord, figures: Figures) -> None:
     if seen.t_s[0] > 5.0:
         at = (seen.t_s[0] / 2, top)
         axes["z"].annotate("start window", at, (0, -4), textcoords="offset points", ha="center", va="top", color=GREY)
-    axes["z"].legend(loc="lower left", ncols=2, fontsize=9, framealpha=0.9)
+    axes["z"].legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=5, fontsize=9, frameon=False)
     ax = axes["error"]
     error, sd = (seen.d_m - truth_at(record, seen.t_s))[:, 2] * 1e3, seen.std_m[:, 2] * 1e3
     ax.fill_between(seen.t_s, -2 * sd, 2 * sd, color=BLUE, alpha=0.25, lw=0, label="2 sd, as published")

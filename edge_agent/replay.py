@@ -146,7 +146,10 @@ class _Replay:
         else:
             part = output.with_name(output.name + PART)
             metadata = dict(read_metadata(self.files[0]).get(RUN_METADATA, {}))
-            metadata.update({"replayed_from": ", ".join(p.name for p in self.files)})
+            for key in ("previous_name", "previous_sha256"):  # of the input; the output follows nobody
+                metadata.pop(key, None)
+            metadata["platform"] = assemble.platform_name()
+            metadata["replayed_from"] = ", ".join(p.name for p in self.files)
             attachments = {CONFIG_NAME: self.settings.text.encode(), **dict(self.settings.files)}
             self.writer = SegmentWriter(part, metadata=metadata, attachments=attachments)
             try:
@@ -225,6 +228,11 @@ class _Replay:
         if raw.order > self.pipeline.order and not self.fresh:
             self.report.raw_gaps += 1
             self.blind = True
+            # what the lost block caused, as far as recorded
+            self.report.unverifiable += sum(len(q) for q in self.mine.values())
+            self.report.unverifiable += sum(len(q) for q in self.theirs.values())
+            self.mine.clear()
+            self.theirs.clear()
             self.report.note(f"raw blocks {self.pipeline.order}..{raw.order - 1} are not in the recording")
         self.fresh = False
         self.report.raws += 1
