@@ -242,7 +242,11 @@ def _simulate(args: argparse.Namespace) -> int:
 
     if args.scenario not in SCENARIOS:
         raise WrongUseError(f"simulate: no scenario {args.scenario!r}; there are: {', '.join(SCENARIOS)}")
-    for path in write_files(simulate(args.scenario, args.seed, args.seconds), args.output):
+    try:
+        record = simulate(args.scenario, args.seed, args.seconds)
+    except ValueError as e:
+        raise WrongUseError(f"simulate: {e}") from None
+    for path in write_files(record, args.output):
         print(path)
     return GOOD
 

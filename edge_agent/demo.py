@@ -394,8 +394,8 @@ def draw(path: Path, seen: Seen, record: SimRecord, figures: Figures) -> None:
         ax.fill_between(seen.t_s[f], d - 2 * sd, d + 2 * sd, color=BLUE, alpha=0.25, lw=0, label="fused, 2 sd")
         ax.plot(t[plain], clipped[plain], ".", ms=4, color=GREY, label="raw GNSS")
         o, r = verdict == Verdict.OFFSET, verdict == Verdict.REJECTED
-        ax.plot(t[o], clipped[o], ".", ms=5, color=ORANGE, label="raw GNSS, used less a level offset")
-        ax.plot(t[r], clipped[r], "x", ms=5, mew=1.3, color=RED, label="raw GNSS, rejected (at the edge: beyond)")
+        ax.plot(t[o], clipped[o], ".", ms=5, color=ORANGE, label="used less a level offset")
+        ax.plot(t[r], clipped[r], "x", ms=5, mew=1.3, color=RED, label="rejected (at the edge: beyond)")
         ax.plot(seen.t_s[f], d, "-", lw=1.6, color=BLUE, label="fused")
         ax.plot(grid[inside], truth[inside, axis], "-", lw=0.8, color=BLACK, label="truth")
         ax.set(xlim=(begin, stop), ylim=(low, high), title=title, ylabel="displacement [mm]", xlabel="time [s]")
@@ -427,7 +427,7 @@ def draw(path: Path, seen: Seen, record: SimRecord, figures: Figures) -> None:
     if seen.t_s[0] > 5.0:
         at = (seen.t_s[0] / 2, top)
         axes["z"].annotate("start window", at, (0, -4), textcoords="offset points", ha="center", va="top", color=GREY)
-    axes["z"].legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=5, fontsize=9, frameon=False)
+    axes["z"].legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=6, fontsize=9, frameon=False)
     ax = axes["error"]
     error, sd = (seen.d_m - truth_at(record, seen.t_s))[:, 2] * 1e3, seen.std_m[:, 2] * 1e3
     ax.fill_between(seen.t_s, -2 * sd, 2 * sd, color=BLUE, alpha=0.25, lw=0, label="2 sd, as published")

@@ -394,9 +394,9 @@ class FusionSettings:
     outage_s: float = 5.0  # after so long without a used fix, three must agree where the prediction cannot protect
     lockout_s: float = 10.0  # refusals that agree on nothing may last so long, then everything is re-opened
     accel_noise_m2ps3: float = 1e-7  # centre of the prior on q: 0.03 mg/rtHz, a good MEMS; two-sided density
-    accel_noise_decades: float = 2.0  # its sd in powers of ten: from a quartz servo to a poorly mounted sensor
+    accel_noise_decades: float = 1.25  # its sd in powers of ten: from a quartz servo to a poorly mounted sensor
     bias_walk_m2ps5: float = 1e-9  # centre of the prior on qb: about 1 mg in an hour with temperature
-    bias_walk_decades: float = 3.0  # its sd in powers of ten: a tilting shaker needs 1e-5
+    bias_walk_decades: float = 2.5  # its sd in powers of ten: a tilting shaker needs 1e-5
     gnss_only_q_m2ps3: float = 1e-6  # without accelerations: what velocity does by itself (wind, thermal motion)
     gnss_only_qb_m2ps5: float = 1e-4  # and the walk of the acceleration; both are only where the bank begins
     bank_memory_s: float = 600.0  # evidence on q, qb is forgotten over so long: temperature and traffic change

@@ -30,6 +30,7 @@ CHECKPOINT = "/raw/checkpoint"
 CONFIG_NAME = "config.yaml"
 DERIVED = ("/gnss/", "/accel/", "/fusion/", "/events")
 TOLERANCE_SD = 1e-3
+ROUNDING = 2.0**-22  # of recorded velocities; displacements are finer
 NAMED = 20
 
 
@@ -102,6 +103,8 @@ def in_order(inputs: Sequence[Path]) -> list[Path]:
         else:
             names = [path]
         for p in names:
+            if p.stat().st_size == 0:  # killed as it was made
+                continue
             first = next(read_messages(p), None)
             if first is not None:
                 found.append((first.log_ns, p.name, p))
@@ -130,6 +133,7 @@ class _Replay:
         self.report = Report(verify=verify)
         self.pipeline: Pipeline = assemble.pipeline(settings)
         self.fresh = True  # nothing has been stepped
+        self.new_run = False  # the file begins another run than the one before: its state is its own
         self.opened = False  # the output has its first checkpoint
         self.blind = False  # raw blocks were lost: nothing can be compared up to the next checkpoint
         self.own_state = False  # started from nothing: recorded checkpoints say nothing about this pipeline
@@ -172,13 +176,15 @@ class _Replay:
         return self.report
 
     def _all(self) -> None:
+        runs = [read_metadata(path).get(RUN_METADATA, {}) for path in self.files]
+        ids = [run.get("run") for run in runs]
         for i, path in enumerate(self.files):
             self.report.segments += 1
-            run = read_metadata(path).get(RUN_METADATA, {})
-            here = run.get("platform", "")
+            here = runs[i].get("platform", "")
             self.report.same_platform &= not here or here == assemble.platform_name()
+            self.new_run = i > 0 and ids[i] != ids[i - 1]
             last_raw_log = self._segment(path)
-            if i + 1 == len(self.files):
+            if i + 1 == len(self.files) or ids[i + 1] != ids[i]:
                 self._out(self.pipeline.finish())
             self._settle(last_raw_log)
 
@@ -200,7 +206,9 @@ class _Replay:
     def _checkpoint(self, stored: Stored, path: Path) -> None:
         point = topics.decode_checkpoint(stored.data)
         self._settle(None)
-        if not self.fresh and point.order == self.pipeline.order and (self.own_state or not self.blind):
+        goes_on = not self.fresh and not self.new_run and point.order == self.pipeline.order
+        self.new_run = False
+        if goes_on and (self.own_state or not self.blind):
             rotate = self.pipeline.rotate(point.reason, point.monotonic_ns)
             if not self.own_state and topics.decode_checkpoint(rotate.checkpoint.data).state != point.state:
                 self.report.state_differs += 1
@@ -309,6 +317,8 @@ class _Replay:
 
     def _settle(self, last_raw_log: int | None) -> None:
         """At the border of a segment or the end of a file: what has no partner by now never will have."""
+        for topic in list(self.theirs):  # what `finish` gave found no record that came after it
+            self._match(topic)
         for topic, mine in self.mine.items():
             for a in mine:
                 if last_raw_log is not None and a.log_ns >= last_raw_log:
@@ -331,20 +341,19 @@ class _Replay:
 
 
 def close(schema: str, a: bytes, b: bytes) -> bool:
-    """Another platform's record: the same but for numbers within 1e-3 of the message's own sd (or 1e-6 relative)."""
+    """Another platform's record: numbers that have an sd of their own (`std_<name>`) within 1e-3 of it, the others
+    within 0.2 % (sd are recorded with 10 bits); everything else the same."""
     x, y = dict(_leaves("", topics.decode(schema, a))), dict(_leaves("", topics.decode(schema, b)))
-    if x.keys() != y.keys():
-        return False
-    spread = [v for k, v in y.items() if "std" in k and isinstance(v, float) and math.isfinite(v) and v > 0]
-    allowed = TOLERANCE_SD * min(spread, default=0.0)
-    for key, u in x.items():
-        v = y[key]
-        if isinstance(u, float) and isinstance(v, float):
-            if not (u == v or (math.isnan(u) and math.isnan(v)) or abs(u - v) <= max(allowed, 1e-6 * abs(v))):
-                return False
-        elif u != v:
-            return False
-    return True
+    return x.keys() == y.keys() and all(_near(x[k], y[k], y.get(f".std_{k[1:]}")) for k in x)
+
+
+def _near(u: object, v: object, sd: object) -> bool:
+    if not (isinstance(u, float) and isinstance(v, float)):
+        return u == v
+    if u == v or (math.isnan(u) and math.isnan(v)):
+        return True
+    allowed = TOLERANCE_SD * sd + ROUNDING if isinstance(sd, float) else 2e-3 * abs(v)
+    return abs(u - v) <= allowed
 
 
 def _leaves(path: str, value: object) -> Iterator[tuple[str, object]]:

@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -43,6 +43,7 @@ BACKOFF_S = (1.0, 60.0)  # first and longest wait before a port is opened again
 RETRY_NS = 5 * m.S  # a refusing disk is tried again after so long
 STATE_FILE = "state/kept.bin"
 RECORD_OVERHEAD = 120  # bytes that a record costs in a queue beside its data
+HEAD_RECORDS = 64  # Ticks, faults and diagnostics that wait for the first data; then the first file begins without
 
 INFO, WARNING, ERROR = 20, 30, 40
 Payload = bytes | m.CanFrames | m.Tick
@@ -73,13 +74,14 @@ class Keep:
 
 
 class Account:
-    """Ledger of one port: received = written + queued + dropped + refused. Each counter has one writing thread."""
+    """Ledger of one port: received = written + queued + dropped + refused + lost; one thread writes each counter."""
 
     def __init__(self) -> None:
         self.received = 0  # reader
         self.dropped = 0  # reader: inbox full
         self.refused = 0  # main: outbox full
         self.written = 0  # writer
+        self.lost = 0  # writer: the disk refused
         self.bytes = 0  # reader
 
 
@@ -96,8 +98,8 @@ class Reader(threading.Thread):
         try:
             self._run()
         except BaseException as e:  # noqa: BLE001 - main raises it and ends the process
-            self.failure = e
             self._fault("CRASH", f"{type(e).__name__}: {e}")
+            self.failure = e
 
     def _run(self) -> None:
         wait = BACKOFF_S[0]
@@ -157,13 +159,15 @@ class Writer(threading.Thread):
         self.accounts = accounts
         self.failure: BaseException | None = None
         self.want_rotate = False  # read and cleared by main
+        self.holding = False  # no file is open, records wait in the ring; what main says of losses waits too
+        self.open_file = (0, 0)  # Rotates taken so far, bytes of the open file; one value, so that both are of one time
         self.faults: deque[m.Fault] = deque()
         self.lost: dict[str, list[int]] = {}  # topic -> [count, first log_time, last log_time]
         self.lock = threading.Lock()
-        self.open_bytes = 0
-        self._ring: deque[m.Record | m.Rotate] = deque()
+        self._rotates = 0
+        self._ring: deque[m.Record | m.Rotate] = deque()  # empty or a Rotate and what follows it
         self._ring_bytes = 0
-        self._holding = False
+        self._told = False  # of the disk's refusal
         self._retry_ns = 0
 
     def run(self) -> None:
@@ -174,93 +178,122 @@ class Writer(threading.Thread):
                 for item in items:
                     self._one(item, now)
                 self._due(now)
-            with suppress(RecordingError):
-                self.recorder.close()
+            self._end(time.monotonic_ns())
         except BaseException as e:  # noqa: BLE001 - main raises it and ends the process
             self.failure = e
+
+    def _end(self, now: int) -> None:
+        if self.holding and self._ring:
+            self._resume(now)
+        for item in self._ring:
+            self._lose(item)
+        try:
+            self.recorder.close()
+        except RecordingError as e:
+            self._failed(e, now)
 
     def _one(self, item: m.Record | m.Rotate | Keep, now: int) -> None:
         if isinstance(item, Keep):
             self._keep(item.data, now)
-        elif self._holding:
-            self._hold(item)
-            if isinstance(item, m.Rotate) and now >= self._retry_ns:
-                self._resume(now)
-        else:
+            return
+        self._rotates += isinstance(item, m.Rotate)
+        if not self.holding:
             self._write(item, now)
+            return
+        self._hold(item, now)
+        if isinstance(item, m.Rotate) and now >= self._retry_ns:
+            self._resume(now)
 
-    def _write(self, item: m.Record | m.Rotate, now: int) -> None:
+    def _write(self, item: m.Record | m.Rotate, now: int) -> bool:
+        """Whether a file is open behind it."""
         try:
             self.recorder.handle(item, now)
-            if isinstance(item, m.Record) and not item.derived and item.topic.startswith("/raw/"):
-                account = self.accounts.get(item.topic[5:])
-                if account is not None:
-                    account.written += 1
         except RecordingError as e:
-            self._failed(e, now)
+            self._failed(e, now, item)
+            return not self.holding
+        if isinstance(item, m.Record) and (account := self._account(item)):
+            account.written += 1
+        return True
 
-    def _failed(self, e: RecordingError, now: int) -> None:
-        for record in e.unwritten:
-            self._lose(record)
-        text = f"{e}; records wait in memory until the disk takes them"
-        self.faults.append(m.Fault(now, "recorder", "DISK_" + e.reason.upper(), text))
-        self._holding = self.recorder.path is None
-        if self._holding:
+    def _account(self, record: m.Record) -> Account | None:
+        return self.accounts.get(record.topic[5:]) if record.topic.startswith("/raw/") else None
+
+    def _failed(self, e: RecordingError, now: int, item: m.Record | m.Rotate | None = None) -> None:
+        """The disk refused, at `item` or at a flush. Main must see `holding` and `want_rotate` before what they hold
+        back, or a LOSS or a fault would go where nothing is written."""
+        self.holding = self.recorder.path is None
+        waits = self.holding and isinstance(item, m.Rotate)  # no file could be begun: the order stands
+        if self.holding and not waits:
             self.want_rotate = True
-            self._retry_ns = now + RETRY_NS
+        for record in e.unwritten:
+            if waits and isinstance(item, m.Rotate) and record is item.checkpoint:
+                continue
+            if record is not item and (account := self._account(record)):
+                account.written -= 1
+            self._lose(record)
+        if waits and item is not None:
+            self._hold(item, now)
+        if not (self.holding and self._told):
+            text = f"{e}; records wait in memory until the disk takes them" if self.holding else str(e)
+            self.faults.append(m.Fault(now, "recorder", "DISK_" + e.reason.upper(), text))
+        self._told = self.holding
+        self._retry_ns = now + RETRY_NS
 
-    def _hold(self, item: m.Record | m.Rotate) -> None:
+    def _hold(self, item: m.Record | m.Rotate, now: int) -> None:
         """Keep for later what follows the newest Rotate; without one, or over the bound, it is lost and counted."""
+        bound = self.settings.ring_mb * MB
         if isinstance(item, m.Rotate):
-            for old in self._ring:
-                self._lose(old)
-            self._ring, self._ring_bytes = deque([item]), len(item.checkpoint.data)
+            self._drop_ring()
+            self._ring.append(item)
+            self._ring_bytes = len(item.checkpoint.data)
             return
         size = len(item.data) + RECORD_OVERHEAD
-        if not self._ring or (item.derived and self._ring_bytes + size > DERIVED_SHARE * self.settings.ring_mb * MB):
+        if not self._ring or (item.derived and self._ring_bytes + size > DERIVED_SHARE * bound):
             self._lose(item)
-            return
-        if self._ring_bytes + size > self.settings.ring_mb * MB:
-            for old in self._ring:
-                self._lose(old)
-            self._ring, self._ring_bytes = deque(), 0
-            self._lose(item)
+        elif self._ring_bytes + size > bound:
             self.want_rotate = True  # a file can only begin at a checkpoint
-            return
-        self._ring.append(item)
-        self._ring_bytes += size
+            self._drop_ring()
+            self._lose(item)
+            self.faults.append(m.Fault(now, "recorder", "RING_FULL", "the disk still refuses; held records are lost"))
+        else:
+            self._ring.append(item)
+            self._ring_bytes += size
+
+    def _drop_ring(self) -> None:
+        for old in self._ring:
+            self._lose(old)
+        self._ring.clear()
+        self._ring_bytes = 0
 
     def _resume(self, now: int) -> None:
-        held, self._ring, self._holding = list(self._ring), deque(), False
-        size, self._ring_bytes = self._ring_bytes, 0
-        for i, item in enumerate(held):
-            self._write(item, now)
-            if not self._holding:
-                continue
-            if isinstance(item, m.Rotate):  # no file could be begun: everything stays for the next try
-                self._ring, self._ring_bytes, self.want_rotate = deque(held[i:]), size, False
-            else:
-                for lost in held[i + 1 :]:
-                    self._lose(lost)
-            return
-        self.faults.append(m.Fault(now, "recorder", "DISK_OK", "recording goes on"))
+        held, self._ring, self._ring_bytes = list(self._ring), deque(), 0
+        good = True
+        for item in held:
+            if good:
+                good = self._write(item, now)
+            else:  # refused again: behind a Rotate the rest waits on, else it is lost
+                self._hold(item, now)
+        if good:
+            self.holding = self._told = False
+            self.faults.append(m.Fault(now, "recorder", "DISK_OK", "recording goes on"))
 
     def _due(self, now: int) -> None:
-        if self._holding:
+        if self.holding:
             if self._ring and now >= self._retry_ns:
                 self._resume(now)
-            return
-        try:
-            self.recorder.idle(now)
-        except RecordingError as e:
-            self._failed(e, now)
-        self.open_bytes = self.recorder.open_bytes
-        for fault in self.recorder.drain_faults():
-            self.faults.append(fault)
+        else:
+            try:
+                self.recorder.idle(now)
+            except RecordingError as e:
+                self._failed(e, now)
+        self.open_file = self._rotates, self.recorder.open_bytes
+        self.faults.extend(self.recorder.drain_faults())
 
     def _lose(self, item: m.Record | m.Rotate) -> None:
         if isinstance(item, m.Rotate):
             return
+        if account := self._account(item):
+            account.lost += 1
         with self.lock:
             note_loss(self.lost, item)
 
@@ -306,6 +339,7 @@ class PortWatch:
         unit, good = ("bytes", "sentence") if self.kind == "serial" else ("frames", "sample")
         if age["bytes"] > self.SILENT_S:
             state, text = "SILENT", f"nothing has come for {age['bytes']:.0f} s: check power, cable and device"
+            self._since["good"] = self._since["positions"] = t_ns  # what comes next gets its time to be understood
         elif age["good"] > self.SILENT_S:
             hint = "baud rate and protocol" if self.kind == "serial" else "bit rate, ids and DBC file"
             state = "GARBAGE" if self.kind == "serial" else "NO_MATCH"
@@ -313,8 +347,8 @@ class PortWatch:
         elif self.kind == "serial" and age["positions"] > self.POSITION_S:
             state = "NO_POSITION"
             text = f"good sentences come, but no position for {age['positions']:.0f} s: switch on GGA (and GST)"
-        elif not self._seen["bytes"]:
-            return None
+        elif not self._seen["good"] or (self.state == "SILENT" and age["good"] > 0):
+            return None  # not yet known
         else:
             state, text = "OK", f"good {good}s come"
         if state == self.state:
@@ -343,8 +377,9 @@ class Agent:
         state_path = Path(config.data_dir) / STATE_FILE
         self.writer = Writer(self.outbox, recorder, record, state_path, self.accounts)
         self.readers = {n: Reader(n, p, self.inbox, self.accounts[n], self.stop) for n, p in ports.items()}
-        self._head: deque[m.Record] = deque(maxlen=64)  # Ticks and faults before the first file
+        self._head: list[m.Record] = []  # what came before the first file
         self._open = False
+        self._rotates = 0
         self._period = 0  # of the rotation grid that the open segment belongs to
         self._lost: dict[str, list[int]] = {}  # topic -> [count, first, last log_time], refused by the outbox
         self._dropped: dict[str, int] = dict.fromkeys(ports, 0)  # told so far
@@ -357,9 +392,24 @@ class Agent:
         receivers = [r.name for r in c.receivers.values() if r.port == port]
         return receivers + [a.name for a in c.accelerometers.values() if a.port == port]
 
-    def run(self) -> int:
-        """Returns 0 after an orderly stop; raises what a thread raised."""
+    def run(self, found: Sequence[m.Fault] = ()) -> int:
+        """Returns 0 after an orderly stop; raises what a thread raised, after what is in hand has been written.
+
+        `found` = faults from before the start, recorded as soon as the time is known.
+        """
         self.writer.start()
+        try:
+            self._run(found)
+        finally:
+            self.outbox.close()
+            self.writer.join()
+            for topic, (count, _, _) in self.writer.lost.items():
+                self._print(f"lost at the disk, and told in no file: {count} of {topic}")
+        if self.writer.failure is not None:
+            raise self.writer.failure
+        return 0
+
+    def _run(self, found: Sequence[m.Fault]) -> None:
         clock = self.readers.pop("clock")
         clock.start()
         started = False
@@ -369,6 +419,10 @@ class Agent:
                 self._arrived(arrival)
                 if not started and isinstance(arrival.payload, m.Tick):
                     started = True  # the map to UTC is known: now the sensors
+                    ports = ", ".join(self.config.ports) or "no ports"
+                    self.say(INFO, f"edge-agent {version('edge-agent')} at {self.config.site}: {ports}")
+                    for fault in found:
+                        self.fault(fault)
                     for reader in self.readers.values():
                         reader.start()
             self._failures(everyone)
@@ -384,14 +438,13 @@ class Agent:
         self._tell_losses()
         self._put(Keep(self.pipeline.slow()))
         self.say(INFO, "stopped")
-        self.outbox.close()
-        self.writer.join()
         self._failures(everyone)
-        return 0
 
     def _failures(self, readers: list[Reader]) -> None:
         for failure in (*(r.failure for r in readers), self.writer.failure):
             if failure is not None:
+                for arrival in self.inbox.take(0.0):  # the fault that tells of it among them
+                    self._arrived(arrival)
                 raise failure
 
     # ----------------------------------------------------------------------------------------------------- each block
@@ -408,7 +461,12 @@ class Agent:
             return
         self._rotate_if_due(arrival.t_ns, tick)
         raw = m.Raw(arrival.t_ns, self.pipeline.order, arrival.source, arrival.payload)
-        for record in self.pipeline.step(raw):
+        try:
+            records = self.pipeline.step(raw)
+        except BaseException:  # this program is wrong: the block that shows it must be in the recording
+            self._put(topics.raw_record(raw, self.pipeline.segment_utc_ns))
+            raise
+        for record in records:
             self._put(record)
         if isinstance(arrival.payload, m.CanFrames) and arrival.payload.dropped:
             self._kernel[arrival.source] = self._kernel.get(arrival.source, 0) + arrival.payload.dropped
@@ -419,28 +477,35 @@ class Agent:
     def _rotate_if_due(self, t_ns: int, tick: bool) -> None:
         record = self.config.record
         utc = self.pipeline.to_utc(t_ns)
+        rotates, size = self.writer.open_file
         if not self._open:
-            if tick:
+            if tick and len(self._head) < HEAD_RECORDS:
                 return  # no file before there is data
             self._rotate("start", t_ns)
-            head, self._head = self._head, deque(maxlen=64)
+            head, self._head = self._head, []
             for held in head:
                 self._put(held)
         elif self.pipeline.rotate_due:
             self._rotate(self.pipeline.rotate_due, t_ns)
         elif self.writer.want_rotate:
             self._rotate("disk", t_ns)
-        elif utc // (record.rotate_s * m.S) != self._period:
+        elif utc // (record.rotate_s * m.S) > self._period:
             self._rotate("time", t_ns)
-        elif self.writer.open_bytes >= record.rotate_mb * MB:
+        elif rotates == self._rotates and size >= record.rotate_mb * MB:
             self._rotate("size", t_ns)
 
     def _rotate(self, reason: str, t_ns: int) -> None:
+        if self._open:
+            self._tell_losses()  # in the file that they are about
+        utc = self.pipeline.to_utc(t_ns)
         rotate = self.pipeline.rotate(reason, t_ns)
+        if reason in ("start", "clock"):
+            utc = rotate.utc_ns
         self._open = True
+        self._rotates += 1
         self.writer.want_rotate = False
-        self.writer.open_bytes = 0
-        self._period = rotate.utc_ns // (self.config.record.rotate_s * m.S)
+        # by the map before too: one that moves back a little must not cross the same border again
+        self._period = max(utc, rotate.utc_ns) // (self.config.record.rotate_s * m.S)
         self._stamp = rotate.utc_ns
         self.outbox.put(rotate, len(rotate.checkpoint.data), float("inf"))
         self._transforms()
@@ -498,6 +563,8 @@ class Agent:
         )
 
     def _tell_losses(self) -> None:
+        if self.writer.holding:
+            return  # later, into a file
         offset = self.pipeline.to_utc(0)
         with self.writer.lock:
             disk, self.writer.lost = self.writer.lost, {}
@@ -514,7 +581,7 @@ class Agent:
 
     def _every_second(self, t_ns: int) -> None:
         self._stamped(t_ns)
-        while self.writer.faults:
+        while self.writer.faults and not self.writer.want_rotate:
             self.fault(self.writer.faults.popleft())
         if self.outbox.bytes < DERIVED_SHARE * self.outbox.limit_bytes:
             self._tell_losses()
@@ -536,18 +603,19 @@ class Agent:
         status = topics.Status
         found = []
         for name, a in self.accounts.items():
-            queued = a.received - a.written - a.dropped - a.refused
+            queued = a.received - a.written - a.dropped - a.refused - a.lost
             ledger = {
                 "received": a.received,
                 "written": a.written,
                 "queued": queued,
                 "dropped_inbox": a.dropped,
                 "refused_outbox": a.refused,
+                "lost_disk": a.lost,
                 "dropped_kernel": self._kernel.get(name, 0),
                 "bytes": a.bytes,
             }
             state = self._watch[name].state if name in self._watch else "OK"
-            level = 0 if state in ("OK", "START") and not (a.dropped or a.refused) else 1
+            level = 0 if state in ("OK", "START") and not (a.dropped or a.refused or a.lost) else 1
             found.append(status(level, f"port/{name}", state, {k: str(v) for k, v in ledger.items()}))
         for name, count in counters.items():
             found.append(status(0, f"codec/{name}", "", {k: str(v) for k, v in count.items()}))
@@ -556,7 +624,7 @@ class Agent:
         values = {
             "inbox_bytes": str(self.inbox.bytes),
             "outbox_bytes": str(self.outbox.bytes),
-            "file_bytes": str(self.writer.open_bytes),
+            "file_bytes": str(self.writer.open_file[1]),
             "disk_free_bytes": str(free),
             "rss_bytes": str(resident_bytes()),
             "clock_sync": str(int(wall.sync)),
@@ -631,7 +699,4 @@ def run(config: m.Config) -> int:
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)
-    agent.say(INFO, f"edge-agent {version('edge-agent')} at {config.site}: {', '.join(config.ports) or 'no ports'}")
-    for fault in found:
-        agent.fault(fault)
-    return agent.run()
+    return agent.run(found)

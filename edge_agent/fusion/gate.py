@@ -1,16 +1,19 @@
 """The gate of one point: joint chi-square test of each fix and what follows from runs of refusals.
 
-A fix fits when the sum over the axes of nu^2 / S stays below the chi-square quantile. Single misfits are dropped. A wrong
-ambiguity fix, though, is a *constant* offset: at least four refusals of the last eight that agree with one another open the level
-offset o, and fusion goes on with z - o, which still carries velocity, bias and relative motion. The offset ends
+A fix fits when the sum over the axes of nu^2 / S stays below the chi-square quantile. Single misfits are dropped. A
+wrong ambiguity fix, though, is a *constant* offset: at least four refusals of the last eight that agree with one
+another open the level offset o, and fusion goes on with z - o, which still carries velocity, bias and relative
+motion. The offset ends
 
 - when fixes agree with o = 0 again: four in a row and the likelihood ratio of "o = 0" against "o as estimated" beyond
   e^6 (a small offset fits o = 0 now and then; the ratio tells them apart);
 - after `reacquire_s`: the level is real, d takes it over (DATUM);
 - another level that four refusals agree on replaces it.
 
-Refusals that agree on nothing for `lockout_s` re-open everything (REACQUIRE): nothing locks out. After a float spell or an
-outage that left the prediction too wide to protect (P > 25 R) three fixes in a row must agree before one is used.
+Refusals that agree on nothing for `lockout_s` mean that the prediction is wrong, not the fixes: the filter begins anew
+at the next one (REACQUIRE), so nothing locks out. After a float spell
+or an outage that left the prediction too wide to protect (P > 25 R) three fixes in a row must agree before one is
+used.
 
 Scalars only: this runs per point and only while a point is not calm.
 """
@@ -66,7 +69,7 @@ class Action(enum.IntEnum):
     CLOSE = 5  # o = 0, then use
     DATUM = 6  # d += o, then use
     CONFIRM = 7  # refused: waiting for three that agree
-    REACQUIRE = 8  # set o to `level`, widen velocity and bias too, then use
+    REACQUIRE = 8  # the prediction is worth nothing: begin anew at this fix
     RESUME = 9  # three agree after an outage: use
     CONSUMED = 10  # refused, but counted towards closing
 
@@ -86,6 +89,7 @@ class Gate:
         self.fits_zero = 0
         self.ratio = 0.0
         self.confirm = False
+        self.confirm_ns = 0
         self.waiting: list[tuple[int, Three, Three]] = []
         self.level: Three = (0.0, 0.0, 0.0)
         self.calm = True  # nothing open and the last eight were accepted
@@ -109,9 +113,14 @@ class Gate:
         log-likelihood of o = 0 less that of the estimated o for this fix."""
         if need_confirm and not self.confirm:
             self.confirm = True
+            self.confirm_ns = t_ns
             self.waiting = []
         if self.confirm:
             self.calm = False
+            if t_ns - self.confirm_ns > lockout_ns:
+                self.confirm = False
+                self.forget()
+                return Action.REACQUIRE
             if self.waiting and not self._agree(t_ns, level, R, Pv, self.waiting[-1], limit):
                 self.waiting = []
             self.waiting.append((t_ns, level, R))
@@ -125,14 +134,14 @@ class Gate:
             return self._open(t_ns, level)
         if self.open:
             if t_ns - self.open_ns > reacquire_ns or t_ns - self.begin_ns > 4 * reacquire_ns:
-                self._reset()
+                self.forget()
                 return Action.DATUM
             self.ratio = max(0.0, self.ratio + evidence)
             self.fits_zero = self.fits_zero + 1 if fits_zero else 0
             if not fits_zero:
                 self.ratio = 0.0
             if self.fits_zero >= AGREE and self.ratio > CLOSE_RATIO:
-                self._reset()
+                self.forget()
                 return Action.CLOSE
         self._push(t_ns, not fits, level, R)
         if fits:
@@ -153,7 +162,7 @@ class Gate:
             )
             return self._open(t_ns, mean)
         if since_used_ns > lockout_ns and len(self.history) >= AGREE:
-            self._open(t_ns, level)
+            self.forget()
             return Action.REACQUIRE
         return Action.SKIP
 
@@ -170,7 +179,8 @@ class Gate:
         self.calm = False
         return action
 
-    def _reset(self) -> None:
+    def forget(self) -> None:
+        """Close without a word and forget the levels seen."""
         self.open = False
         self.fits_zero = 0
         self.ratio = 0.0
@@ -195,7 +205,7 @@ class Gate:
         return {
             "open": self.open, "open_ns": self.open_ns, "begin_ns": self.begin_ns,
             "history": [[h[0], h[1], list(h[2]), list(h[3])] for h in self.history],
-            "fits_zero": self.fits_zero, "ratio": self.ratio, "confirm": self.confirm,
+            "fits_zero": self.fits_zero, "ratio": self.ratio, "confirm": self.confirm, "confirm_ns": self.confirm_ns,
             "waiting": [[w[0], list(w[1]), list(w[2])] for w in self.waiting],
             "level": list(self.level), "calm": self.calm,
         }  # fmt: skip
@@ -203,7 +213,8 @@ class Gate:
     def load(self, s: State) -> None:
         self.open, self.open_ns, self.begin_ns = s["open"], s["open_ns"], s["begin_ns"]
         self.history = [(t, r, _three(a), _three(b)) for t, r, a, b in s["history"]]
-        self.fits_zero, self.ratio, self.confirm = s["fits_zero"], s["ratio"], s["confirm"]
+        self.fits_zero, self.ratio = s["fits_zero"], s["ratio"]
+        self.confirm, self.confirm_ns = s["confirm"], s["confirm_ns"]
         self.waiting = [(t, _three(a), _three(b)) for t, a, b in s["waiting"]]
         self.level, self.calm = _three(s["level"]), s["calm"]
 

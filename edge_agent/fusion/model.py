@@ -2,8 +2,9 @@
 
 State per axis: displacement d [m], velocity v [m/s], accelerometer bias b [m/s2] relative to the reference that was
 taken off before integration, level offset o [m] of the receiver's solution (zero with zero variance while no jump and
-no float spell is open, so the measurement row is always d + o). A Gauss-Markov multipath state m belongs between b and
-o: give it the next index, a row in `transition`, an entry in `process_noise` and a one in `MEASURED`.
+no float spell is open, so the measurement row is always d + o). A Gauss-Markov multipath state m belongs beside o: give
+it the next index, its decay in `transition`, its variance in `process_noise`, and add it to the sums of d + o in
+`kalman`.
 
 Arrays put the state first: x (N, P, 3), C (N, N, P, 3) for P points and three axes, so that one operation on one state
 touches one contiguous plane. The input is the acceleration's first-order-hold integrals over the interval: s1 adds to
@@ -15,45 +16,73 @@ Equations: Smyth & Wu (2007) for the multi-rate form; q is the two-sided spectra
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from edge_agent.messages import F64
 
 D, V, B, O = 0, 1, 2, 3  # noqa: E741  the level offset's usual letter
 N = 4
-MEASURED = (D, O)
-"""States whose sum a fix measures."""
 
 
-def transition(dt: F64 | float) -> F64:
-    """F(dt), shape (N, N) + shape of dt [s]."""
-    t = np.asarray(dt, dtype=np.float64)
-    F = np.zeros((N, N, *t.shape))
-    for i in range(N):
-        F[i, i] = 1.0
-    F[D, V] = t
-    F[D, B] = -0.5 * t * t
-    F[V, B] = -t
-    return F
+def transition(dt: Sequence[float]) -> F64:
+    """F per interval [s], shape (N, N, len(dt), 1)."""
+    return _last_two(
+        [[1.0, t, -0.5 * t * t, 0.0, 0.0, 1.0, -t, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0] for t in dt]
+    )
 
 
-def process_noise(dt: F64 | float, q: F64 | float, qb: F64 | float) -> F64:
-    """Q(dt), shape (N, N) + broadcast shape: white acceleration noise q [m2/s3] and bias walk qb [m2/s5] over dt [s]."""
-    t, q, qb = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (dt, q, qb)))
-    Q = np.zeros((N, N, *t.shape))
-    t2 = t * t
-    t3 = t2 * t
-    Q[D, D] = t3 * (q * (1 / 3) + qb * (t2 * (1 / 20)))
-    Q[D, V] = Q[V, D] = t2 * (q * 0.5 + qb * (t2 * (1 / 8)))
-    Q[V, V] = t * q + qb * (t3 * (1 / 3))
-    Q[D, B] = Q[B, D] = qb * (t3 * (-1 / 6))
-    Q[V, B] = Q[B, V] = qb * (t2 * -0.5)
-    Q[B, B] = qb * t
-    return Q
+def process_noise(dt: Sequence[float]) -> tuple[F64, F64]:
+    """Q per interval [s] for unit densities: Qa of white acceleration noise, Qb of the bias walk, (N, N, len(dt), 1).
+
+    Q = q Qa + qb Qb.
+    """
+    white = []
+    walk = []
+    for t in dt:
+        t2 = t * t
+        t3 = t2 * t
+        a, b = t3 / 3.0, 0.5 * t2
+        white.append([a, b, 0.0, 0.0, b, t, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        a, b, c, d, e = t3 * t2 / 20.0, t2 * t2 / 8.0, t3 / -6.0, t3 / 3.0, -0.5 * t2
+        walk.append([a, b, c, 0.0, b, d, e, 0.0, c, e, t, 0.0, 0.0, 0.0, 0.0, 0.0])
+    return _last_two(white), _last_two(walk)
 
 
-def gap_noise(length: F64 | float, since: F64 | float, q: F64 | float) -> tuple[F64, F64, F64]:
+def _last_two(rows: list[list[float]]) -> F64:
+    a = np.array(rows)
+    return a.T.reshape(N, N, len(rows), 1)
+
+
+def gap_noise(length: F64 | float, since: F64 | float, q: F64) -> tuple[F64, F64, F64]:
     """Variances (d, dv, v) of white acceleration noise q [m2/s3] that lasted `length` s and ended `since` s ago."""
-    L = np.asarray(length, dtype=np.float64)
-    e = np.asarray(since, dtype=np.float64)
-    return q * L * (L * L * (1 / 3) + L * e + e * e), q * L * (0.5 * L + e), q * L
+    dd: F64 = q * length * (length * length * (1 / 3) + length * since + since * since)
+    dv: F64 = q * length * (0.5 * length + since)
+    vv: F64 = q * length
+    return dd, dv, vv
+
+
+# Rows: coefficients of (1, D, ..., D^5) of the variance of d, then of v, D after the anchor; columns: dd dv db vv vb bb
+# of the covariance at the anchor, q, qb. From F C F' + Q(D).
+_GROWTH = np.zeros((12, 8))
+for _row, _column, _factor in (
+    (0, 0, 1.0), (1, 1, 2.0), (2, 3, 1.0), (2, 2, -1.0), (3, 4, -1.0), (3, 6, 1 / 3), (4, 5, 0.25), (5, 7, 1 / 20),
+    (6, 3, 1.0), (7, 4, -2.0), (7, 6, 1.0), (8, 5, 1.0), (9, 7, 1 / 3),
+):  # fmt: skip
+    _GROWTH[_row, _column] = _factor
+_I = np.array([0, 0, 0, 1, 1, 2])
+_J = np.array([0, 1, 2, 1, 2, 2])
+
+
+def growth(C: F64, q: F64, qb: F64) -> F64:
+    """Polynomial coefficients in D of the variances of d and v after the anchor: (6, P, 6), channels d xyz, v xyz."""
+    basis = np.empty((8, *q.shape))
+    basis[:6] = C[_I, _J]
+    basis[6] = q
+    basis[7] = qb
+    c = (_GROWTH[:, :, None, None] * basis).sum(axis=1)
+    out = np.empty((6, q.shape[0], 6))
+    out[:, :, :3] = c[:6]
+    out[:, :, 3:] = c[6:]
+    return out

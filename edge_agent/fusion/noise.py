@@ -5,14 +5,14 @@ add; never below the floor; one step of the last decimal adds its uniform varian
 
 **R scale**: receivers misstate their sd. Per axis the factor on R follows the median of nu^2 / S (0.4549 for a
 chi-square of one degree): a step of fixed size up or down per fix, so an outlier counts no more than any other. It
-starts from the median absolute third difference of z - J(t) over the start window (J the integrated accelerations), which
-white noise fills and slow motion does not.
+starts from the median absolute third difference of z - J(t) over the start window (J the integrated accelerations),
+which white noise fills and slow motion does not.
 
-**Bank**: one three-state filter (d, v, b) per pair (q/r, qb/r) on a fixed grid, everything relative to r, so that all axes
-share one covariance and r itself is concentrated: r = mean of nu^2 / s per axis. Each member's likelihood is kept
-with a forgetting time; q and qb are the posterior's means in the logarithm. The grid spans what structures and sensors
-can do, so the start is wide and the data narrow it. Source of the construction: the project's numerical study; maximum
-likelihood for q and r after Shan & Qi.
+**Bank**: one three-state filter (d, v, b) per pair (q/r, qb/r) on a fixed grid, everything relative to r, so that all
+axes share one covariance and r itself is concentrated: r = mean of nu^2 / s per axis. Each member's likelihood is
+kept with a forgetting time; q and qb are the posterior's means in the logarithm. The grid spans what structures and
+sensors can do, so the start is wide and the data narrow it. Source of the construction: the project's numerical
+study; maximum likelihood for q and r after Shan & Qi.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from edge_agent.messages import F64, FusionSettings, Quality, State
 CHI1_MEDIAN = 0.45493642311957283
 """Median of a chi-square of one degree of freedom."""
 
-# sd of a fix whose receiver sends no GST [m]: horizontal per unit of HDOP, vertical per unit of VDOP. Fixed: 10 mm + 20 mm
-# is the usual data sheet's 8 mm + 1 ppm and 15 mm + 1 ppm with margin; the others are the classes' usual accuracy.
+# sd of a fix whose receiver sends no GST [m]: horizontal per unit of HDOP, vertical per unit of VDOP. Fixed: the usual
+# data sheet's 8 mm + 1 ppm and 15 mm + 1 ppm; the others are the classes' usual accuracy.
 _BY_QUALITY = {
     Quality.SINGLE: (2.5, 5.0),
     Quality.DGNSS: (0.5, 1.0),
@@ -171,7 +171,9 @@ class Bank:
         self.sum_l[:, p] += [math.log(v) for v in self.product[:, p].tolist()]
         self.product[:, p] = 1.0
 
-    def posterior(self, p: int, prior: list[tuple[float, float, float, float]]) -> list[tuple[float, float, float, int]]:
+    def posterior(
+        self, p: int, prior: list[tuple[float, float, float, float]]
+    ) -> list[tuple[float, float, float, int]]:
         """Per axis: mean log(q/r), mean log(qb/r), log r, index of the best member.
 
         `prior` per axis: centre and inverse variance of log(q/r), the same of log(qb/r).
@@ -227,9 +229,9 @@ def third_difference_std(w: F64) -> list[float]:
 def robust_mask(t: F64, w: F64) -> list[bool]:
     """Which of the start window's epochs t (n,) s, w = z - J(t) (n, 3) belong together.
 
-    A line with curvature by iterated reweighting (weights 1/|residual|, near the L1 fit), then everything beyond 5 robust sd
-    of the residual is left out. Where the accelerometer's bias wanders, the residual of the curve is no noise; then the
-    residual from its own running median is judged instead.
+    A line with curvature by iterated reweighting (weights 1/|residual|, near the L1 fit), then everything beyond 5
+    robust sd of the residual is left out. Where the accelerometer's bias wanders, the residual of the curve is no
+    noise; then each epoch is judged against the Theil-Sen line through its nine neighbours.
     """
     n = len(t)
     u = (t - t[0]) * (2.0 / (t[-1] - t[0])) - 1.0
@@ -244,14 +246,25 @@ def robust_mask(t: F64, w: F64) -> list[bool]:
         weight = 1.0 / np.maximum(size, 0.5)
     spread = float(np.sort(size)[n // 2])
     if spread > 6.0:  # 1.54 = median of a chi of three degrees; far beyond it the curve does not fit
-        half = 4
         for i in range(n):
-            lo, hi = max(0, i - half), min(n, i + half + 1)
-            e[i] = scaled[i] - np.sort(scaled[lo:hi], axis=0)[(hi - lo) // 2]
+            lo = min(max(0, i - 4), max(0, n - 9))
+            e[i] = _off_line(u[lo : lo + 9] - u[i], scaled[lo : lo + 9], i - lo)
         size = np.sqrt((e * e).sum(axis=1))
         spread = float(np.sort(size)[n // 2])
     limit = 5.0 * max(spread / 1.538, 1.0)
     return [bool(v) for v in size <= limit]
+
+
+def _off_line(u: F64, y: F64, i: int) -> F64:
+    """Residual (3,) of row i of y (n, 3) from the Theil-Sen line over u (n,), where u[i] = 0: medians of the slopes of
+    all pairs, then of what they leave."""
+    n = len(u)
+    slopes = np.sort(np.stack([(y[k] - y[j]) / (u[k] - u[j]) for j in range(n) for k in range(j + 1, n)]), axis=0)
+    m = len(slopes)
+    slope = 0.5 * (slopes[(m - 1) // 2] + slopes[m // 2])
+    level = np.sort(y - u[:, None] * slope, axis=0)[n // 2]
+    out: F64 = y[i] - level
+    return out
 
 
 def _fit(basis: F64, y: F64, weight: F64) -> F64:

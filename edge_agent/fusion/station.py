@@ -6,16 +6,18 @@ its measurement time however late it comes, without rewinding anything:
     d(t) = d + v D + S2 - b D^2 / 2        v(t) = v + S1 - b D          D = t - anchor
 
 A fix waits for accelerations up to its time, at most `wait_s` of raw time; then the gap rule bridges what is missing
-(mean of the last 10 s, extra noise q_gap = 2 var(a) tau with tau the reciprocal mean frequency). One receiver on one wire
-delivers in order, so a fix not newer than the anchor is OLD: reported, dropped.
+(mean of the last 10 s, extra noise q_gap = 2 var(a) tau with tau the reciprocal mean frequency). One receiver on one
+wire delivers in order, so a fix not newer than the anchor is OLD: reported, dropped.
 
-Kinds of points. *Both sensors*: as above. *No accelerometer* (or one that is silent for `accel_lost_s`): the same filter with
-zero integrals, where -b is the acceleration and its walk the model; one estimate per fix, mode GNSS_ONLY. *No receiver*:
-there is no absolute displacement; displacement is held about zero by one pseudo-measurement a second with sd
-`accel_only_std_m`, so vibration above some 0.05 Hz is right and the quasi-static part is not there; mode ACCEL_ONLY.
+Kinds of points. *Both sensors*: as above. *No accelerometer* (or one that is silent for `accel_lost_s`): the same
+filter with zero integrals, where -b is the acceleration and its walk the model; one estimate per fix, mode GNSS_ONLY.
+*No receiver*: there is no absolute displacement; displacement is held about zero by one pseudo-measurement a second
+with sd `accel_only_std_m`, so vibration above some 0.05 Hz is right and the quasi-static part is not there; mode
+ACCEL_ONLY.
 
 A sample's estimate uses every fix that was handed over before it and is not later than it, so it does not depend on how
-the accelerations were cut into blocks. Samples with a NaN axis are left out (a missing sample). Nothing is emitted before the start.
+the accelerations were cut into blocks. Samples with a NaN axis are left out (a missing sample). Nothing is emitted
+before the start.
 """
 
 from __future__ import annotations
@@ -26,11 +28,13 @@ from typing import TypeAlias
 
 import numpy as np
 
-from edge_agent.fusion import kalman
+from edge_agent.fusion import kalman, live
+from edge_agent.fusion.feed import Feed
 from edge_agent.fusion.gate import Action, Gate, Three, quantile
-from edge_agent.fusion.integrals import AFTER_GAP, CHUNK, NS, SYNTHETIC, Ring
-from edge_agent.fusion.model import B, D, N, O, V, gap_noise
+from edge_agent.fusion.integrals import CHUNK, NS, SYNTHETIC, block
+from edge_agent.fusion.model import B, D, N, O, V, gap_noise, process_noise, transition
 from edge_agent.fusion.noise import CHI1_MEDIAN, Bank, robust_mask, third_difference_std
+from edge_agent.fusion.point import Point, Wait
 from edge_agent.messages import (
     F64,
     I64,
@@ -52,7 +56,15 @@ from edge_agent.messages import (
 
 Out: TypeAlias = list[Estimate | Innovation | Event]
 
-SOLID = (Quality.FIXED, Quality.PPS, Quality.MANUAL, Quality.SIMULATED, Quality.DGNSS, Quality.SINGLE, Quality.ESTIMATED)
+SOLID = (
+    Quality.FIXED,
+    Quality.PPS,
+    Quality.MANUAL,
+    Quality.SIMULATED,
+    Quality.DGNSS,
+    Quality.SINGLE,
+    Quality.ESTIMATED,
+)
 """Qualities whose declared sd is taken as it is; FLOAT wanders and has its own model."""
 START_QUALITY = (Quality.FIXED, Quality.MANUAL, Quality.SIMULATED)
 REBASE_NS = 30 * S
@@ -62,86 +74,8 @@ START_FIXES = 2000
 """Fixes of a start window at most: 15 s at more than 100 Hz."""
 PENDING = 256
 """Fixes that wait for accelerations at most; the oldest is applied without them."""
-NOMINAL = 33
-"""Samples from which an accelerometer's interval is learnt."""
-
-
-class _Gap:
-    """A stretch without accelerations, bridged by the mean."""
-
-    __slots__ = ("begin_ns", "end_ns", "q")
-
-    def __init__(self, begin_ns: int, end_ns: int, q: F64) -> None:
-        self.begin_ns, self.end_ns, self.q = begin_ns, end_ns, q
-
-
-class _Wait:
-    __slots__ = ("deadline_ns", "fix")
-
-    def __init__(self, fix: Measurement, deadline_ns: int) -> None:
-        self.fix, self.deadline_ns = fix, deadline_ns
-
-
-class Point:
-    """What is kept per point besides the stacked arrays."""
-
-    def __init__(self, settings: PointSettings) -> None:
-        self.name = settings.name
-        self.receiver = settings.receiver
-        self.accelerometer = settings.accelerometer
-        self.gate = Gate()
-        self.started = False
-        self.aided = False  # accelerations drive the prediction
-        self.floating = False
-        self.uncertain = False
-        self.anchor_ns = 0
-        self.used_ns = 0  # last fix that was used
-        self.begun_ns = 0  # start of the present model (with or without accelerations)
-        self.posterior_ns = 0
-        self.run_ns = -1  # accelerations are uninterrupted since
-        self.nominal_ns = 0  # interval of the samples, learnt
-        self.intervals: list[int] = []
-        self.gaps: list[_Gap] = []
-        self.pending: list[_Wait] = []
-        self.window: list[tuple[int, F64, F64, F64, F64]] = []  # t, s1, s2, z, std
-        self.window_aided = False
-        self.mode = int(Mode.INIT)
-        self.fixes = 0  # used since the start, for the tracker's first steps
-        self.since_bank = 0.0  # seconds of increments that the bank has not seen
-
-    SIMPLE = (
-        "started", "aided", "floating", "uncertain", "anchor_ns", "used_ns", "begun_ns", "posterior_ns", "run_ns",
-        "nominal_ns", "window_aided", "mode", "fixes", "since_bank",
-    )  # fmt: skip
-
-    def save(self) -> State:
-        s: State = {k: getattr(self, k) for k in self.SIMPLE}
-        s["gate"] = self.gate.save()
-        s["intervals"] = list(self.intervals)
-        s["gaps"] = [[g.begin_ns, g.end_ns, g.q] for g in self.gaps]
-        s["pending"] = [_save_fix(w.fix, w.deadline_ns) for w in self.pending]
-        s["window"] = [list(w) for w in self.window]
-        return s
-
-    def load(self, s: State) -> None:
-        for k in self.SIMPLE:
-            setattr(self, k, s[k])
-        self.gate.load(s["gate"])
-        self.intervals = list(s["intervals"])
-        self.gaps = [_Gap(*g) for g in s["gaps"]]
-        self.pending = [_Wait(*_load_fix(f)) for f in s["pending"]]
-        self.window = [tuple(w) for w in s["window"]]
-
-
-def _save_fix(f: Measurement, deadline_ns: int) -> list[object]:
-    return [
-        f.t_ns, f.arrival_ns, list(f.z_m), list(f.std_m), int(f.quality), f.time_uncertain, deadline_ns,
-    ]  # fmt: skip
-
-
-def _load_fix(v: list[object]) -> tuple[Measurement, int]:
-    t, arrival, z, std, quality, uncertain, deadline = v
-    return Measurement(t, arrival, tuple(z), tuple(std), Quality(quality), uncertain), deadline  # type: ignore[arg-type]
+Piece: TypeAlias = tuple[I64, F64, F64, U8, U8]
+"""t (n,), displacement and velocity (n, 6), their sd (n, 6), mode and flags (n,)."""
 
 
 class Station:
@@ -157,19 +91,16 @@ class Station:
         self.settings = settings
         self.points = [Point(s) for group in by_receiver.values() for s in group]
         self.of_receiver: dict[str, list[int]] = {}
-        self.of_accelerometer: dict[str, list[int]] = {}
         for i, p in enumerate(self.points):
             if p.receiver is not None:
                 self.of_receiver.setdefault(p.receiver, []).append(i)
-            if p.accelerometer is not None:
-                self.of_accelerometer.setdefault(p.accelerometer, []).append(i)
         n = len(self.points)
-        self.ring = Ring(n)
+        self.feed = Feed(self.points, settings)
+        self.ring = self.feed.ring
         self.bank = Bank(n, settings)
         self.x: F64 = np.zeros((N, n, 3))
         self.C: F64 = np.zeros((N, N, n, 3))
-        self.g1: F64 = np.zeros((n, 3))  # integrals at the anchor
-        self.g2: F64 = np.zeros((n, 3))
+        self.g: F64 = np.zeros((n, 6))  # integrals (g2, g1) at the anchor
         self.q: F64 = np.full((n, 3), settings.accel_noise_m2ps3)
         self.qb: F64 = np.full((n, 3), settings.bias_walk_m2ps5)
         self.scale: F64 = np.ones((n, 3))  # on the declared R
@@ -187,29 +118,18 @@ class Station:
     def accelerations(self, blocks: Mapping[str, AccelBlock], now_ns: int) -> Out:
         """Take blocks by accelerometer; returns what waiting fixes and the samples themselves cause."""
         out: Out = []
-        rows: list[tuple[int, I64, F64, U8]] = []
-        for name, block in blocks.items():
-            t, a = block.t_ns, block.xyz
-            good = np.isfinite(a).all(axis=1)
-            if not good.all():
-                t, a = t[good], a[good]
-            for p in self.of_accelerometer.get(name, ()):
-                made = self._rows(p, t, a, out)
-                if made is not None:
-                    rows.append((p, *made))
-        if not rows:
-            return out
-        rows.sort(key=lambda r: r[0])
-        longest = max(len(r[1]) for r in rows)
-        pieces: dict[int, list[tuple[F64, ...]]] = {r[0]: [] for r in rows}
-        for lo in range(0, longest, CHUNK):
-            self._append([(p, t[lo : lo + CHUNK], a[lo : lo + CHUNK], k[lo : lo + CHUNK]) for p, t, a, k in rows])
-            touched = [r[0] for r in rows]
-            self._settle(touched, now_ns, out, pieces)
-            self._emit(touched, [self.ring.head[p] for p in touched], pieces, out)
+        pieces: dict[int, list[Piece]] = {}
+        lo = 0
+        more = True
+        while more:
+            points, events, more = self.feed.take(blocks, lo)
+            lo += CHUNK
+            out += events
+            if points:
+                self._settle(points, now_ns, out, pieces)
+                self._emit(points, None, pieces, out)
         for p, parts in pieces.items():
-            if parts:
-                out.append(self._estimate(p, parts))
+            out.append(self._estimate(p, parts))
         return out
 
     def fix(self, receiver: str, fix: Measurement, now_ns: int) -> Out:
@@ -224,7 +144,7 @@ class Station:
             return out
         deadline = now_ns + int(self.settings.wait_s * S)
         for p in points:
-            self.points[p].pending.append(_Wait(fix, deadline))
+            self.points[p].pending.append(Wait(fix, deadline))
         self._settle(points, now_ns, out, None)
         return out
 
@@ -245,153 +165,20 @@ class Station:
         """The receiver's reference is known after all: its zero stays where it is."""
         self.unset.discard(receiver)
 
-    # --------------------------------------------------------------------------------------------------- accelerations
-
-    def _rows(self, p: int, t: I64, a: F64, out: Out) -> tuple[I64, F64, U8] | None:
-        """Rows for the ring: only newer ones, gaps bridged."""
-        pt = self.points[p]
-        last = self.ring.last_ns(p)
-        if len(t) and int(t[0]) <= last:
-            keep = t > last
-            t, a = t[keep], a[keep]
-        if not len(t):
-            return None
-        t0 = int(t[0])
-        if last < 0:
-            pt.run_ns = t0
-        step = np.diff(t, prepend=last if last >= 0 else t0)
-        if not pt.nominal_ns or (len(pt.intervals) and last >= 0):
-            self._learn(pt, step if last >= 0 else step[1:])
-        limit = self._gap_limit(pt)
-        synthetic = last >= 0 and bool(self.ring.kind[p, self.ring.head[p] - 1] & SYNTHETIC)
-        if int(step.max()) <= limit and not synthetic:
-            return t, a, np.zeros(len(t), dtype=np.uint8)
-        ts: list[I64] = []
-        rows: list[F64] = []
-        kinds: list[U8] = []
-        begin = 0
-        previous = last
-        for i in [int(v) for v in np.flatnonzero(step > limit)] or [0]:
-            if i == 0 and last < 0:
-                continue
-            if i:
-                ts.append(t[begin:i])
-                rows.append(a[begin:i])
-                kinds.append(np.zeros(i - begin, dtype=np.uint8))
-                previous = int(t[i - 1])
-            begin = i
-            mean, q, opened = self._gap_mean(p, previous, t[:i], a[:i], synthetic and i == 0)
-            if opened:
-                ts.append(np.array([previous]))
-                rows.append(mean[None])
-                kinds.append(np.array([SYNTHETIC], dtype=np.uint8))
-            ts.append(t[i : i + 1])
-            rows.append(mean[None])
-            kinds.append(np.array([SYNTHETIC], dtype=np.uint8))
-            self._gap(p, previous, int(t[i]), q)
-            if int(t[i]) - pt.gaps[-1].begin_ns > int(self.settings.accel_absent_s * S):
-                pt.run_ns = int(t[i])
-            if pt.started and pt.aided:
-                g = pt.gaps[-1]
-                seconds = (g.end_ns - g.begin_ns) / S
-                out.append(
-                    Event(
-                        g.end_ns, "ACCEL_GAP", pt.name, f"no accelerations for {seconds:.3f} s; bridged by their mean",
-                        (("gap_s", seconds),), g.begin_ns, g.end_ns,
-                    )
-                )  # fmt: skip
-        ts.append(t[begin:])
-        rows.append(a[begin:])
-        kinds.append(np.zeros(len(t) - begin, dtype=np.uint8))
-        return np.concatenate(ts), np.concatenate(rows), np.concatenate(kinds)
-
-    def _learn(self, pt: Point, step: I64) -> None:
-        pt.intervals += [int(v) for v in step[: NOMINAL - len(pt.intervals)]]
-        if len(pt.intervals) >= NOMINAL:
-            pt.nominal_ns = sorted(pt.intervals)[NOMINAL // 2]
-            pt.intervals = []
-
-    def _gap_limit(self, pt: Point) -> int:
-        return max(50_000_000, pt.nominal_ns * 7 // 2) if pt.nominal_ns else S
-
-    def _gap(self, p: int, begin_ns: int, end_ns: int, q: F64) -> None:
-        gaps = self.points[p].gaps
-        if gaps and gaps[-1].end_ns == begin_ns:
-            gaps[-1].end_ns = end_ns
-        else:
-            gaps.append(_Gap(begin_ns, end_ns, q))
-            if len(gaps) > 64:  # no fix for many gaps: the oldest two become one
-                gaps[1] = _Gap(gaps[0].begin_ns, gaps[1].end_ns, np.maximum(gaps[0].q, gaps[1].q))
-                del gaps[0]
-
-    def _gap_mean(self, p: int, until_ns: int, t: I64, a: F64, going_on: bool) -> tuple[F64, F64, bool]:
-        """Mean (with gravity), q_gap and whether the gap begins here. `t`, `a`: rows of this block before the gap."""
-        ring = self.ring
-        if going_on:
-            gaps = self.points[p].gaps
-            q = gaps[-1].q if gaps else self._gap_figures(p, until_ns, t, a)[1]
-            return ring.a[p, ring.head[p] - 1] + ring.reference[p], q, False
-        mean, q = self._gap_figures(p, until_ns, t, a)
-        return mean, q, True
-
-    def _gap_figures(self, p: int, until_ns: int, t: I64, a: F64) -> tuple[F64, F64]:
-        seconds = self.settings.accel_mean_s
-        t1, a1 = self.ring.recent(p, until_ns, seconds)
-        a1 = a1 + self.ring.reference[p]
-        new = t >= until_ns - int(seconds * S)
-        tt = np.concatenate([t1, t[new]])[-2048:]
-        aa = np.concatenate([a1, a[new]])[-2048:]
-        if len(tt) < 8:
-            last = aa[-1] if len(aa) else self.ring.reference[p]
-            return last, np.full(3, 1e-3)
-        mean = aa.sum(axis=0) * (1.0 / len(aa))
-        e = aa - mean
-        var = (e * e).sum(axis=0) * (1.0 / len(aa))
-        d = aa[1:] - aa[:-1]
-        rate = (d * d).sum(axis=0) * (1.0 / len(d))
-        h = (int(tt[-1]) - int(tt[0])) * NS / (len(tt) - 1)
-        tau = np.clip(np.sqrt(var / np.maximum(rate, 1e-30)) * h, h, 0.5)
-        return mean, 2.0 * var * tau + 1e-12
-
-    def _append(self, rows: list[tuple[int, I64, F64, U8]]) -> None:
-        rows = [r for r in rows if len(r[1])]
-        if not rows:
-            return
-        count = [len(r[1]) for r in rows]
-        n = max(count)
-        if len(rows) == 1:
-            p, t, a, k = rows[0]
-            self.ring.append([p], t[None], a[None], k[None], count)
-            return
-        tt = np.empty((len(rows), n), dtype=np.int64)
-        aa = np.empty((len(rows), n, 3))
-        kk = np.zeros((len(rows), n), dtype=np.uint8)
-        for i, (_, t, a, k) in enumerate(rows):
-            c = count[i]
-            tt[i, :c] = t
-            aa[i, :c] = a
-            kk[i, :c] = k
-            if c < n:
-                tt[i, c:] = t[-1]
-                aa[i, c:] = a[-1]
-        self.ring.append([r[0] for r in rows], tt, aa, kk, count)
-
     # ----------------------------------------------------------------------------------------------- fixes meet samples
 
-    def _ready(self, p: int, w: _Wait, now_ns: int) -> bool:
+    def _ready(self, p: int, w: Wait, now_ns: int) -> bool:
         pt = self.points[p]
         if pt.accelerometer is None:
             return True
-        last = self.ring.last_ns(p)
+        last = self.ring.last_ns[p]
         if last >= w.fix.t_ns or last < 0:
             return True
         if w.fix.t_ns - last > int(self.settings.accel_absent_s * S):
             return True
         return now_ns >= w.deadline_ns or len(pt.pending) > PENDING
 
-    def _settle(
-        self, points: Iterable[int], now_ns: int, out: Out, pieces: dict[int, list[tuple[F64, ...]]] | None
-    ) -> None:
+    def _settle(self, points: Iterable[int], now_ns: int, out: Out, pieces: dict[int, list[Piece]] | None) -> None:
         """Apply every waiting fix that is ready, points of one receiver together."""
         points = list(points)
         for p in points:
@@ -402,27 +189,25 @@ class Station:
             if not ready:
                 return
             first = self.points[ready[0]].pending[0].fix
-            group = [p for p in ready if self.points[p].pending[0].fix is first]
+            group = [p for p in ready if self.points[p].pending[0].fix == first]
             for p in group:
                 del self.points[p].pending[0]
             if pieces is not None:
-                cut = [
-                    int(self.ring.t[p, : self.ring.head[p]].searchsorted(first.t_ns, side="left")) for p in group
-                ]
+                cut = [self.ring.row(p, first.t_ns) for p in group]
                 self._emit(group, cut, pieces, out)
             self._apply(group, first, out)
 
     def _pseudo(self, p: int) -> None:
         """Points without receiver: one pseudo-measurement of zero at every whole second of monotonic time."""
         pt = self.points[p]
-        last = self.ring.last_ns(p)
+        last = self.ring.last_ns[p]
         begin = pt.pending[-1].fix.t_ns if pt.pending else max(pt.anchor_ns, self.ring.first_ns[p])
         t = (begin // PSEUDO_NS + 1) * PSEUDO_NS
         if last - t > 600 * PSEUDO_NS:
             t = (last // PSEUDO_NS) * PSEUDO_NS
         std = self.settings.accel_only_std_m
         while t <= last:
-            pt.pending.append(_Wait(Measurement(t, t, (0.0, 0.0, 0.0), (std, std, std), Quality.FIXED), t))
+            pt.pending.append(Wait(Measurement(t, t, (0.0, 0.0, 0.0), (std, std, std), Quality.FIXED), t))
             t += PSEUDO_NS
 
     def _verdict(self, p: int, fix: Measurement, verdict: Verdict) -> Innovation:
@@ -432,18 +217,6 @@ class Station:
             self.points[p].name, fix.t_ns, np.zeros(3), np.diag(R), 0.0, verdict, fix.arrival_ns - fix.t_ns,
             np.array(fix.std_m), np.zeros(3),
         )  # fmt: skip
-
-    def _bridge(self, p: int, t_ns: int) -> None:
-        """No accelerations up to a fix: hold their mean."""
-        ring = self.ring
-        last = ring.last_ns(p)
-        going_on = bool(ring.kind[p, ring.head[p] - 1] & SYNTHETIC)
-        mean, q, opened = self._gap_mean(p, last, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), going_on)
-        times = [last, t_ns] if opened else [t_ns]
-        t = np.array(times, dtype=np.int64)
-        self._append([(p, t, np.broadcast_to(mean, (len(times), 3)), np.full(len(times), SYNTHETIC, dtype=np.uint8))])
-        self._gap(p, last, t_ns, q)
-        ring.out[p] = ring.head[p]
 
     def _apply(self, group: list[int], fix: Measurement, out: Out) -> None:
         """One fix to points whose accelerations are there (or will not come)."""
@@ -460,21 +233,19 @@ class Station:
         if live:
             self._step(live, fix, out)
 
-    def _increment(self, p: int, t_ns: int) -> tuple[F64, F64]:
+    def _increment(self, p: int, t_ns: int, dt: float) -> tuple[F64, F64]:
         """Integrals (s1, s2) from the anchor to t; the anchor's integrals move to t. The anchor itself does not."""
-        dt = (t_ns - self.points[p].anchor_ns) * NS
-        _, _, g1, g2 = self.ring.at(p, t_ns)
-        s1 = g1 - self.g1[p]
-        s2 = g2 - self.g2[p] - self.g1[p] * dt
-        self.g1[p] = g1
-        self.g2[p] = g2
-        return s1, s2
+        _, _, g = self.ring.at(p, t_ns)
+        old = self.g[p]
+        s = g - old
+        s2 = s[:3] - old[3:] * dt
+        self.g[p] = g
+        return s[3:], s2
 
     def _rebase(self, p: int, t_ns: int) -> None:
         if t_ns - self.ring.origin_ns[p] >= REBASE_NS:
             self.ring.rebase(p, t_ns)
-            self.g1[p] = 0.0
-            self.g2[p] = 0.0
+            self.g[p] = 0.0
 
     # ---------------------------------------------------------------------------------------------------------- start
 
@@ -501,10 +272,11 @@ class Station:
             pt.gaps = []
             pt.window_aided = aided
             if aided:
-                _, _, self.g1[p], self.g2[p] = self.ring.at(p, fix.t_ns)
+                _, _, self.g[p] = self.ring.at(p, fix.t_ns)
             s1 = s2 = zero
         else:
-            s1, s2 = self._increment(p, fix.t_ns) if aided else (zero, zero)
+            dt = (fix.t_ns - pt.anchor_ns) * NS
+            s1, s2 = self._increment(p, fix.t_ns, dt) if aided else (zero, zero)
         pt.anchor_ns = fix.t_ns
         if aided:
             self._rebase(p, fix.t_ns)
@@ -588,7 +360,6 @@ class Station:
         pt.since_bank = 0.0
         self.bank_s1[p] = 0.0
         self.bank_s2[p] = 0.0
-        self.ring.out[p] = self.ring.head[p]
         values = tuple(
             (f"{n}_{a}", float(v[i]))
             for n, v in (("noise_std_m", np.sqrt(R)), ("q_m2ps3", self.q[p]), ("qb_m2ps5", self.qb[p]))
@@ -610,11 +381,10 @@ class Station:
         self.C[D, D, p] = self.settings.accel_only_std_m**2
         self.C[V, V, p] = 0.05**2
         self.C[B, B, p] = 0.05**2
-        _, _, self.g1[p], self.g2[p] = self.ring.at(p, fix.t_ns)
+        _, _, self.g[p] = self.ring.at(p, fix.t_ns)
         pt.started = pt.aided = True
         pt.anchor_ns = pt.used_ns = pt.begun_ns = fix.t_ns
         pt.gaps = []
-        self.ring.out[p] = int(self.ring.t[p, : self.ring.head[p]].searchsorted(fix.t_ns, side="left"))
         text = "vibration starts without a receiver: displacement is about zero, not absolute"
         out.append(Event(fix.t_ns, "START", pt.name, text))
 
@@ -622,44 +392,45 @@ class Station:
 
     def _step(self, points: list[int], fix: Measurement, out: Out) -> None:
         """Predict to the fix, judge, update, learn; the anchor moves to the fix."""
-        s = self.settings
         t = fix.t_ns
         n = len(points)
-        dt = np.empty((n, 1))
+        seconds: list[float] = []
         s1 = np.zeros((n, 3))
         s2 = np.zeros((n, 3))
-        for i, p in enumerate(points):
-            self._model(p, t, out)
-            pt = self.points[p]
-            dt[i] = (t - pt.anchor_ns) * NS
-            if pt.aided:
-                s1[i], s2[i] = self._increment(p, t)
-        run = points[-1] - points[0] + 1 == n
-        k: slice | list[int] = slice(points[0], points[-1] + 1) if run else points
-        x, C = kalman.predict(self.x[:, k], self.C[:, :, k], dt, s1, s2, self.q[k], self.qb[k])
         calm = fix.quality in SOLID
         for i, p in enumerate(points):
             pt = self.points[p]
-            if pt.gaps:
-                self._gap_variance(pt, t, C[:, :, i])
+            if pt.accelerometer is not None:
+                self._model(p, t, out)
+            seconds.append((t - pt.anchor_ns) * NS)
+            if pt.aided:
+                s1[i], s2[i] = self._increment(p, t, seconds[i])
             calm = calm and pt.gate.calm and not pt.floating and t - pt.used_ns <= 5 * S
-        zero = self._zero(points[0])
-        z = np.array(fix.z_m) - zero
+        k = block(points)
+        same = seconds[:1] if seconds.count(seconds[0]) == n else seconds
+        Qa, Qb = process_noise(same)
+        x, C = kalman.predict(self.x[:, k], self.C[:, :, k], transition(same), Qa, Qb, s1, s2, self.q[k], self.qb[k])
+        for i, p in enumerate(points):
+            if self.points[p].gaps and self.points[p].aided:
+                self._gap_variance(self.points[p], t, C[:, :, i])
+        z = np.array(fix.z_m) - self._zero(points[0])
         R0 = np.array(fix.std_m)
-        R = R0 * R0 * self.scale[k]
+        R0 *= R0
+        R = R0 * self.scale[k]
         pseudo = self.points[points[0]].receiver is None
         nu, CH, S_ = kalman.innovation(x, C, z, R)
-        ratio = ((nu * nu / S_).sum(axis=1) * (1.0 / self.limit)).tolist()
-        use = np.ones((n, 1))
+        ratio = self._ratio(nu, S_)
+        use: F64 | float = 1.0
+        used = [True] * n
         verdicts = [Verdict.ACCEPTED] * n
         learn = [True] * n
         if not pseudo and not (calm and max(ratio) <= 1.0):
-            R = R.copy()
             for i, p in enumerate(points):
-                verdicts[i], learn[i] = self._judge(p, fix, z, x[:, i], C[:, :, i], R[i], dt[i], out)
-                use[i] = float(verdicts[i] in (Verdict.ACCEPTED, Verdict.OFFSET))
+                verdicts[i], learn[i] = self._judge(p, fix, z, x[:, i], C[:, :, i], R[i], seconds[i], out)
+                used[i] = verdicts[i] in (Verdict.ACCEPTED, Verdict.OFFSET)
+            use = np.array(used, dtype=np.float64)[:, None]
             nu, CH, S_ = kalman.innovation(x, C, z, R)
-            ratio = ((nu * nu / S_).sum(axis=1) * (1.0 / self.limit)).tolist()
+            ratio = self._ratio(nu, S_)
         x, C = kalman.update(x, C, nu, CH, S_, R, use)
         self.x[:, k] = x
         self.C[:, :, k] = C
@@ -667,28 +438,28 @@ class Station:
         for i, p in enumerate(points):
             pt = self.points[p]
             if not pseudo:
-                v = S_[i]
-                variance = np.zeros((3, 3))
-                variance[0, 0], variance[1, 1], variance[2, 2] = v[0], v[1], v[2]
-                out.append(
-                    Innovation(
-                        pt.name, t, nu[i], variance, ratio[i], verdicts[i], fix.arrival_ns - t, std[i], x[O, i].copy()
-                    )
-                )
+                offset = x[O, i].copy()
+                late = fix.arrival_ns - t
+                out.append(Innovation(pt.name, t, nu[i], _diagonal(S_[i]), ratio[i], verdicts[i], late, std[i], offset))
             pt.anchor_ns = t
             pt.uncertain = fix.time_uncertain
-            if use[i, 0]:
+            if used[i]:
                 pt.used_ns = t
             if pt.aided:
                 self._rebase(p, t)
         if not pseudo:
-            self._learn_noise(points, k, z, R0, nu, S_, dt, s1, s2, learn)
-        for i, p in enumerate(points):
+            self._learn_noise(points, k, z, R0, nu, S_, seconds, s1, s2, learn)
+        for p in points:
             pt = self.points[p]
-            if not pt.aided or (pt.gaps and pt.gaps[-1].end_ns >= t and self.ring.last_ns(p) <= t):
-                if not pseudo:
-                    out.append(self._single(p, t, out))
+            bridged = pt.hold is not None and self.ring.last_ns[p] <= t
+            if not pseudo and (bridged or not pt.aided):
+                out.append(self._single(p, t, out))
             pt.gaps = [g for g in pt.gaps if g.end_ns > t]
+
+    def _ratio(self, nu: F64, S_: F64) -> list[float]:
+        e = nu * nu
+        e /= S_
+        return [(a + b + c) / self.limit for a, b, c in e.tolist()]
 
     def _gap_variance(self, pt: Point, t_ns: int, C: F64) -> None:
         for g in pt.gaps:
@@ -704,20 +475,20 @@ class Station:
     def _model(self, p: int, t_ns: int, out: Out) -> None:
         """Accelerations come or are gone: change the model where it must be."""
         pt = self.points[p]
-        if pt.accelerometer is None:
-            return
         s = self.settings
-        last = self.ring.last_ns(p)
+        last = self.ring.last_ns[p]
         if pt.aided:
             if last >= t_ns:
                 return
-            begin = pt.gaps[-1].begin_ns if pt.gaps and pt.gaps[-1].end_ns == last else last
+            begin = last if pt.hold is None else pt.hold.begin_ns
             if t_ns - begin <= int(s.accel_lost_s * S) or pt.receiver is None:
-                self._bridge(p, t_ns)
+                self.feed.bridge(p, t_ns)
                 return
             pt.aided = False
             pt.run_ns = -1
-            self._change_model(p, np.zeros(3), np.full(3, 0.05**2), s.gnss_only_q_m2ps3, s.gnss_only_qb_m2ps5)
+            q = s.gnss_only_q_m2ps3 if pt.hold is None else np.maximum(pt.hold.q, s.gnss_only_q_m2ps3)
+            self._change_model(p, np.zeros(3), np.full(3, 0.05**2), q, s.gnss_only_qb_m2ps5)
+            pt.hold = None
             seconds = (t_ns - begin) / S
             text = f"no accelerations for {seconds:.0f} s: going on without"
             out.append(Event(t_ns, "ACCEL_LOST", pt.name, text, (("silent_s", seconds),), begin, t_ns))
@@ -733,16 +504,13 @@ class Station:
             self._change_model(p, mean, var + 0.05**2, s.accel_noise_m2ps3, s.bias_walk_m2ps5)
             pt.aided = True
             pt.gaps = [g for g in pt.gaps if g.end_ns > t_ns]
-            _, _, self.g1[p], self.g2[p] = self.ring.at(p, t_ns)
-            # This fix still ends an interval without accelerations: no increment.
-            _, _, g1, g2 = self.ring.at(p, t_ns)
-            dt = (t_ns - pt.anchor_ns) * NS
-            self.g1[p] = g1
-            self.g2[p] = g2 - g1 * dt
-            self.ring.out[p] = self.ring.head[p]
+            # This fix still ends an interval without accelerations: its increment must come out as zero.
+            _, _, g = self.ring.at(p, t_ns)
+            g[:3] -= g[3:] * ((t_ns - pt.anchor_ns) * NS)
+            self.g[p] = g
             out.append(Event(t_ns, "ACCEL_ON", pt.name, "accelerations are there: fusion goes on with them"))
 
-    def _change_model(self, p: int, b: F64, var: F64, q: float, qb: float) -> None:
+    def _change_model(self, p: int, b: F64, var: F64, q: F64 | float, qb: float) -> None:
         pt = self.points[p]
         self.x[B, p] = b
         self.C[B, :, p] = 0.0
@@ -757,7 +525,7 @@ class Station:
     # ------------------------------------------------------------------------------------------------------------ gate
 
     def _judge(
-        self, p: int, fix: Measurement, z: F64, x: F64, C: F64, R: F64, dt: F64, out: Out
+        self, p: int, fix: Measurement, z: F64, x: F64, C: F64, R: F64, dt: float, out: Out
     ) -> tuple[Verdict, bool]:
         """Verdict for one point and whether its noise may learn from it; x, C (N, [N,] 3) and R (3,) in place."""
         pt = self.points[p]
@@ -767,13 +535,12 @@ class Station:
         if fix.quality not in SOLID:
             return self._judge_float(p, fix, z, x, C, R, dt, out), False
         need = t - pt.used_ns > int(s.outage_s * S) and bool((C[D, D] > 25.0 * R).any()) and not gate.open
-        if pt.floating:
-            if not gate.confirm:
-                need = True
-                x[O] = 0.0
-                C[O] = 0.0
-                C[:, O] = 0.0
-                gate._reset()
+        if pt.floating and not gate.confirm:
+            need = True
+            x[O] = 0.0
+            C[O] = 0.0
+            C[:, O] = 0.0
+            gate.forget()
         dd = C[D, D] + R
         level = z - x[D]
         nu = level - x[O]
@@ -804,17 +571,25 @@ class Station:
         if was_floating:
             pt.floating = False
             out.append(Event(t, "FLOAT_END", pt.name, "fixed solution again: three epochs agree"))
-        if action in (Action.OPEN, Action.REOPEN, Action.REACQUIRE):
+        if action == Action.REACQUIRE:
+            values = tuple((f"step_{a}_m", float(v)) for a, v in zip("xyz", z - x[D], strict=True))
+            x[D] = z
+            x[O] = 0.0
+            bias = C[B, B] + 0.1**2
+            C[:] = 0.0
+            C[D, D] = 4.0 * R
+            C[V, V] = 1.0
+            C[B, B] = bias
+            x[V] = 0.0
+            text = "refused fixes agree on nothing: the filter begins anew at this one"
+            out.append(Event(t, "REACQUIRE", pt.name, text, values, pt.used_ns, t))
+            return Verdict.ACCEPTED, False
+        if action in (Action.OPEN, Action.REOPEN):
             x[O] = np.array(gate.level)
             C[O] = 0.0
             C[:, O] = 0.0
             C[O, O] = 1.0
-            if action == Action.REACQUIRE:
-                C[V, V] += 0.05**2
-                C[B, B] += 0.02**2
-                text = "refused fixes agree on nothing: level, velocity and bias are open again"
-                out.append(Event(t, "REACQUIRE", pt.name, text, values))
-            elif action == Action.OPEN:
+            if action == Action.OPEN:
                 text = "fixes agree on another level: fusion goes on with z - o"
                 out.append(Event(t, "JUMP_OPEN", pt.name, text, values))
             else:
@@ -825,9 +600,7 @@ class Station:
             x[O] = 0.0
             C[O] = 0.0
             C[:, O] = 0.0
-            out.append(
-                Event(t, "JUMP_CLOSED", pt.name, "fixes are back at the old level", values, gate.begin_ns, t)
-            )
+            out.append(Event(t, "JUMP_CLOSED", pt.name, "fixes are back at the old level", values, gate.begin_ns, t))
             return Verdict.ACCEPTED, False
         if action == Action.DATUM:
             values = tuple((f"offset_{a}_m", float(v)) for a, v in zip("xyz", x[O], strict=True))
@@ -856,9 +629,7 @@ class Station:
             C[B, B] = np.minimum(C[B, B], 1.0)
         return Verdict.ACCEPTED, False
 
-    def _judge_float(
-        self, p: int, fix: Measurement, z: F64, x: F64, C: F64, R: F64, dt: F64, out: Out
-    ) -> Verdict:
+    def _judge_float(self, p: int, fix: Measurement, z: F64, x: F64, C: F64, R: F64, dt: float, out: Out) -> Verdict:
         pt = self.points[p]
         s = self.settings
         self.bank.fresh[p] = True
@@ -866,11 +637,16 @@ class Station:
         pt.gate.confirm = False
         R *= s.float_r_factor
         if not pt.floating:
+            # A level found before says nothing about the float solution's.
             pt.floating = True
-            C[O, O] += s.float_std_m**2
+            pt.gate.forget()
+            x[O] = 0.0
+            C[O] = 0.0
+            C[:, O] = 0.0
+            C[O, O] = s.float_std_m**2
             out.append(Event(fix.t_ns, "FLOAT_BEGIN", pt.name, "float solution: its wander is estimated beside"))
-        elif not pt.gate.open:
-            phi = math.exp(-float(dt[0]) / s.float_tau_s)
+        else:
+            phi = math.exp(-dt / s.float_tau_s)
             x[O] *= phi
             C[O] *= phi
             C[:, O] *= phi
@@ -890,23 +666,23 @@ class Station:
     # ----------------------------------------------------------------------------------------------------------- noise
 
     def _learn_noise(
-        self, points: list[int], k: slice | list[int], z: F64, R0: F64, nu: F64, S_: F64, dt: F64, s1: F64, s2: F64,
-        learn: list[bool],
+        self, points: list[int], k: slice | list[int], z: F64, R0: F64, nu: F64, S_: F64,
+        dt: list[float], s1: F64, s2: F64, learn: list[bool],
     ) -> None:  # fmt: skip
         s = self.settings
-        self.bank_s2[k] = self.bank_s2[k] + self.bank_s1[k] * dt + s2
+        self.bank_s2[k] = self.bank_s2[k] + self.bank_s1[k] * np.array(dt)[:, None] + s2
         self.bank_s1[k] = self.bank_s1[k] + s1
         due: list[int] = []
-        u = (nu * nu > CHI1_MEDIAN * S_)
+        u = nu * nu > CHI1_MEDIAN * S_
         for i, p in enumerate(points):
             pt = self.points[p]
-            pt.since_bank += float(dt[i, 0])
+            pt.since_bank += dt[i]
             if pt.gaps:
                 self.bank.fresh[p] = True
             if not learn[i]:
                 continue
             pt.fixes += 1
-            step = 1.0 + max(s.r_step, 0.5 / (pt.fixes + 10))
+            step = 1.0 + s.r_step * max(1.0, 50.0 / (pt.fixes + 10))
             scale = self.scale[p] * np.where(u[i], step, 1.0 / step)
             self.scale[p] = np.minimum(np.maximum(scale, s.r_least), s.r_most)
             if self.bank.fresh[p]:
@@ -928,9 +704,9 @@ class Station:
                 pt = self.points[p]
                 young = pt.anchor_ns - pt.begun_ns < int(2 * s.bank_full_s * S)
                 since = pt.anchor_ns - pt.posterior_ns
-                if since >= (S if young else 5 * S):
+                if pt.fixes >= 20 and since >= (S if young else 5 * S):
                     pt.posterior_ns = pt.anchor_ns
-                    self._noise(p, R0 * R0 * self.scale[p], 1e9 if young else 0.1 * since / S)
+                    self._noise(p, R0 * self.scale[p], 1e9 if young else 0.1 * since / S)
 
     def _bank_done(self, p: int) -> None:
         self.points[p].since_bank = 0.0
@@ -938,16 +714,13 @@ class Station:
         self.bank_s2[p] = 0.0
 
     def _noise(self, p: int, R: F64, step: float) -> list[int]:
-        """q and qb from the bank's posterior, at most `step` away in the logarithm; returns the best member per axis."""
+        """q and qb from the bank's posterior, at most `step` away in the logarithm; returns the best member per
+        axis."""
         pt = self.points[p]
         s = self.settings
         w = 1.0 / (math.log(10.0) * s.accel_noise_decades) ** 2
         wb = 1.0 / (math.log(10.0) * s.bias_walk_decades) ** 2
-        q0, qb0 = (
-            (s.accel_noise_m2ps3, s.bias_walk_m2ps5)
-            if pt.aided
-            else (s.gnss_only_q_m2ps3, s.gnss_only_qb_m2ps5)
-        )
+        q0, qb0 = (s.accel_noise_m2ps3, s.bias_walk_m2ps5) if pt.aided else (s.gnss_only_q_m2ps3, s.gnss_only_qb_m2ps5)
         known = self.known[p]
         prior = []
         for axis in range(3):
@@ -968,99 +741,57 @@ class Station:
 
     # ---------------------------------------------------------------------------------------------------------- output
 
-    def _emit(
-        self, points: list[int], upto: list[int], pieces: dict[int, list[tuple[F64, ...]]], out: Out
-    ) -> None:
-        """Estimates of the rows from `ring.out` up to (not with) row `upto`, by the present anchors."""
+    def _emit(self, points: list[int], upto: list[int] | None, pieces: dict[int, list[Piece]], out: Out) -> None:
+        """Estimates of the rows from `ring.out` up to (not with) row `upto`, None = all, by the present anchors."""
         ring = self.ring
-        live: list[int] = []
+        alive: list[int] = []
         first: list[int] = []
         length: list[int] = []
-        for p, hi in zip(points, upto, strict=True):
+        for i, p in enumerate(points):
             lo = ring.out[p]
+            hi = ring.head[p] if upto is None else upto[i]
             if hi <= lo:
                 continue
             ring.out[p] = hi
-            pt = self.points[p]
-            if pt.started and pt.aided:
-                live.append(p)
+            if self.points[p].started and self.points[p].aided:
+                alive.append(p)
                 first.append(lo)
                 length.append(hi - lo)
-        if not live:
+        if not alive:
             return
         n = max(length)
-        even = first.count(first[0]) == len(first) and length.count(n) == len(length)
-        run = live[-1] - live[0] + 1 == len(live)
-        k: slice | list[int] = slice(live[0], live[-1] + 1) if run else live
-        if even and run:
+        k = block(alive)
+        if isinstance(k, slice) and first.count(first[0]) == length.count(n) == len(alive):
             w = slice(first[0], first[0] + n)
-            t, g1, g2, kind = ring.t[k, w], ring.g1[k, w], ring.g2[k, w], ring.kind[k, w]
+            t, g, kind = ring.t[k, w], ring.g[k, w], ring.kind[k, w]
         else:
-            rows = np.minimum(
-                np.array(first)[:, None] + np.arange(n), np.array([f + c - 1 for f, c in zip(first, length, strict=True)])[:, None]
-            )
-            pp = np.array(live)[:, None]
-            t, g1, g2, kind = ring.t[pp, rows], ring.g1[pp, rows], ring.g2[pp, rows], ring.kind[pp, rows]
-        anchor = np.array([self.points[p].anchor_ns for p in live])
-        dt = ((t - anchor[:, None]) * NS)[:, :, None]
-        x = self.x[:, k]
-        C = self.C[:, :, k]
-        q = self.q[k]
-        qb = self.qb[k]
-        a1, a2 = self.g1[k], self.g2[k]
-        b = x[B][:, None]
-        d = g2 + (x[D] - a2)[:, None] + dt * ((x[V] - a1)[:, None] - dt * (0.5 * b))
-        v = g1 + (x[V] - a1)[:, None] - dt * b
-        vd = C[D, D][:, None] + dt * (
-            (2.0 * C[D, V])[:, None]
-            + dt
-            * (
-                (C[V, V] - C[D, B])[:, None]
-                + dt * ((q * (1 / 3) - C[V, B])[:, None] + dt * ((0.25 * C[B, B])[:, None] + dt * (qb * 0.05)[:, None]))
-            )
-        )
-        vv = C[V, V][:, None] + dt * (
-            (q - 2.0 * C[V, B])[:, None] + dt * (C[B, B][:, None] + dt * (qb * (1 / 3))[:, None])
-        )
-        gap_rows: list[U8] = []
-        for i, p in enumerate(live):
+            last = np.array(first) + np.array(length) - 1
+            rows = np.minimum(np.array(first)[:, None] + np.arange(n), last[:, None])
+            pp = np.array(alive)[:, None]
+            t, g, kind = ring.t[pp, rows], ring.g[pp, rows], ring.kind[pp, rows]
+        anchor = np.array([self.points[p].anchor_ns for p in alive])
+        y, var = live.stream(t, g, anchor, self.x[:, k], self.C[:, :, k], self.g[k], self.q[k], self.qb[k])
+        for i, p in enumerate(alive):
             if self.points[p].gaps:
-                self._gap_live(self.points[p], t[i], vd[i], vv[i])
-        sd = np.sqrt(np.maximum(vd, 0.0))
-        sv = np.sqrt(np.maximum(vv, 0.0))
-        del gap_rows
-        s = self.settings
-        worst_h = sd[:, :, :2].max(axis=(1, 2)).tolist()
-        worst_v = sd[:, :, 2].max(axis=1).tolist()
-        for i, p in enumerate(live):
+                live.add_gaps(self.points[p].gaps, int(anchor[i]), t[i], var[i])
+        np.maximum(var, 0.0, out=var)
+        sd = np.sqrt(var)
+        worst = sd[:, :, :3].max(axis=1).tolist()
+        synthetic = bool(kind.any())
+        for i, p in enumerate(alive):
             pt = self.points[p]
             c = length[i]
-            ti = t[i, :c]
-            keep = None
-            if kind[i, :c].any():
-                keep = (kind[i, :c] & SYNTHETIC) == 0
-            mode, flags = self._modes(
-                pt, ti, sd[i, :c],
-                worst_h[i] > s.invalid_std_horizontal_m or worst_v[i] > s.invalid_std_vertical_m,
-            )  # fmt: skip
-            piece = (ti, d[i, :c], v[i, :c], sd[i, :c], sv[i, :c], mode, flags)
-            if keep is not None:
-                piece = tuple(a[keep] for a in piece)  # type: ignore[assignment]
+            mode, flags = self._modes(pt, t[i, :c], sd[i, :c], worst[i])
+            piece = (t[i, :c].copy(), y[i, :c], sd[i, :c], mode, flags)
+            if synthetic:
+                real = kind[i, :c] != SYNTHETIC
+                piece = (piece[0][real], piece[1][real], piece[2][real], piece[3][real], piece[4][real])
             if len(piece[0]):
-                self._mode_events(pt, piece[0], piece[5], out)
-                pieces[p].append(piece)
+                self._mode_events(pt, piece[0], piece[3], out)
+                pieces.setdefault(p, []).append(piece)
 
-    def _gap_live(self, pt: Point, t: I64, vd: F64, vv: F64) -> None:
-        """Add the noise of gaps after the anchor to the variances of rows t."""
-        for g in pt.gaps:
-            begin = max(g.begin_ns, pt.anchor_ns)
-            end = np.minimum(t, g.end_ns)
-            length = np.maximum(end - begin, 0) * NS
-            dd, _, v = gap_noise(length[:, None], ((t - end) * NS)[:, None], g.q)
-            vd += dd
-            vv += v
-
-    def _modes(self, pt: Point, t: I64, sd: F64, wide: bool) -> tuple[U8, U8]:
+    def _modes(self, pt: Point, t: I64, sd: F64, worst: list[float]) -> tuple[U8, U8]:
+        """Mode and flags of rows t with sd (n, 6); `worst` = the largest sd of displacement per axis."""
         s = self.settings
         base = Mode.ACCEL_ONLY if pt.receiver is None else Mode.FUSED
         mode = np.full(len(t), base, dtype=np.uint8)
@@ -1077,9 +808,9 @@ class Station:
         if int(t[-1]) - pt.used_ns > int(s.coast_s * S):
             coast = t - pt.used_ns > int(s.coast_s * S)
             mode[coast] = Mode.COAST
-            flags[coast & (sd > s.degraded_std_m).any(axis=1)] |= np.uint8(FusionFlag.DEGRADED)
+            flags[coast & (sd[:, :3] > s.degraded_std_m).any(axis=1)] |= np.uint8(FusionFlag.DEGRADED)
             mode[t - pt.used_ns > int(s.invalid_outage_s * S)] = Mode.INVALID
-        if wide:
+        if max(worst[:2]) > s.invalid_std_horizontal_m or worst[2] > s.invalid_std_vertical_m:
             bad = (sd[:, :2] > s.invalid_std_horizontal_m).any(axis=1) | (sd[:, 2] > s.invalid_std_vertical_m)
             mode[bad] = Mode.INVALID
         return mode, flags
@@ -1093,32 +824,33 @@ class Station:
             out.append(Event(int(t[i]), "MODE", pt.name, text, (("from", float(pt.mode)), ("to", float(new)))))
             pt.mode = new
 
-    def _estimate(self, p: int, parts: list[tuple[F64, ...]]) -> Estimate:
-        ring = self.ring
-        a = parts[0] if len(parts) == 1 else tuple(np.concatenate(c) for c in zip(*parts, strict=True))
+    def _estimate(self, p: int, parts: list[Piece]) -> Estimate:
+        t, y, sd, mode, flags = parts[0]
+        if len(parts) > 1:
+            t = np.concatenate([a[0] for a in parts])
+            y = np.concatenate([a[1] for a in parts])
+            sd = np.concatenate([a[2] for a in parts])
+            mode = np.concatenate([a[3] for a in parts])
+            flags = np.concatenate([a[4] for a in parts])
+        root = np.sqrt(self.C[_BO, _BO, p])
         return Estimate(
-            self.points[p].name, a[0].copy(), a[1], a[2], a[3], a[4], a[5], a[6],  # type: ignore[arg-type]
-            self.x[B, p] + ring.reference[p], np.sqrt(self.C[B, B, p]), self.x[O, p].copy(),
-            np.sqrt(self.C[O, O, p]),
+            self.points[p].name, t, y[:, :3], y[:, 3:], sd[:, :3], sd[:, 3:], mode, flags,
+            self.x[B, p] + self.ring.reference[p], root[0], self.x[O, p].copy(), root[1],
         )  # fmt: skip
 
     def _single(self, p: int, t_ns: int, out: Out) -> Estimate:
         """The estimate at a fix of a point without accelerations."""
         pt = self.points[p]
-        s = self.settings
-        sd = np.sqrt(self.C[D, D, p])[None]
+        x, C = self.x[:, p], self.C[:, :, p]
+        sd = np.sqrt(np.concatenate([C[D, D], C[V, V]]))[None]
         t = np.array([t_ns])
-        wide = bool((sd[0, :2] > s.invalid_std_horizontal_m).any() or sd[0, 2] > s.invalid_std_vertical_m)
-        mode, flags = self._modes(pt, t, sd, wide)
+        mode, flags = self._modes(pt, t, sd, sd[0, :3].tolist())
         if mode[0] == Mode.FUSED:
             mode[0] = Mode.GNSS_ONLY
         if pt.aided:
-            flags[0] |= np.uint8(FusionFlag.ACCEL_GAP)
+            flags[0] |= FusionFlag.ACCEL_GAP
         self._mode_events(pt, t, mode, out)
-        return self._estimate(
-            p,
-            [(t, self.x[D, p][None].copy(), self.x[V, p][None].copy(), sd, np.sqrt(self.C[V, V, p])[None], mode, flags)],  # type: ignore[list-item]
-        )
+        return self._estimate(p, [(t, np.concatenate([x[D], x[V]])[None], sd, mode, flags)])
 
     # ----------------------------------------------------------------------------------------------------------- state
 
@@ -1153,7 +885,7 @@ class Station:
             "points": {p.name: p.save() for p in self.points},
             "ring": self.ring.save(),
             "bank": self.bank.save(),
-            "arrays": [self.x, self.C, self.g1, self.g2, self.q, self.qb, self.scale, self.bank_s1, self.bank_s2],
+            "arrays": [self.x, self.C, self.g, self.q, self.qb, self.scale, self.bank_s1, self.bank_s2],
             "known": list(self.known),
             "unset": sorted(self.unset),
             "datums": dict(self.datums),
@@ -1165,7 +897,7 @@ class Station:
             p.load(s["points"][p.name])
         self.ring.load(s["ring"])
         self.bank.load(s["bank"])
-        self.x, self.C, self.g1, self.g2, self.q, self.qb, self.scale, self.bank_s1, self.bank_s2 = (
+        self.x, self.C, self.g, self.q, self.qb, self.scale, self.bank_s1, self.bank_s2 = (
             a.copy() for a in s["arrays"]
         )
         self.known = list(s["known"])
@@ -1174,9 +906,15 @@ class Station:
         self.old, self.prechecked = s["counts"]
 
 
+_BO = np.array([B, O])
+
+
+def _diagonal(v: F64) -> F64:
+    out = np.zeros((3, 3))
+    out.reshape(9)[::4] = v
+    return out
+
+
 def _three(v: F64) -> Three:
     a, b, c = v.tolist()
     return (a, b, c)
-
-
-__all__ = ["AFTER_GAP", "Station"]

@@ -119,6 +119,7 @@ class SegmentWriter:
         self._pending.append(record)
         self._writer.add_message(channel, log_ns, record.data, publish_ns, sequence)
         if self._file.size != before:  # the chunk was full
+            self._file.flush()  # else a part of it waits here, to be lost uncounted at the next error
             self._pending.clear()
 
     def flush(self) -> None:

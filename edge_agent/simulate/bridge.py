@@ -14,6 +14,9 @@ from edge_agent.simulate.motion import Motion, Truth, bridge_motion, pick
 from edge_agent.simulate.sensors import AccelTrack, FixLabel, FixTrack, accel_samples, gnss_fixes
 from edge_agent.simulate.specs import EPOCH_UTC_NS, START_NS, Scenario
 
+MAX_S = 14_400.0
+"""A record is held in memory as arrays, about 0.1 MB for each second on the way."""
+
 
 @dataclass(frozen=True, slots=True)
 class SimRecord:
@@ -40,8 +43,8 @@ def run(scenario: Scenario, seed: int, duration_s: float | None = None, utc_ns: 
     """Simulate `scenario`: `duration_s` None = its own length, `utc_ns` = UTC of second 0 (a multiple of the fixes'
     interval, as receivers fix at whole fractions of UTC). Raises ValueError for a length that is not positive."""
     length = scenario.duration_s if duration_s is None else duration_s
-    if not 0 < length <= 86400:
-        raise ValueError("simulate: the duration must be above 0 and at most 86400 s")
+    if not 0 < length <= MAX_S:
+        raise ValueError(f"simulate: the duration must be above 0 and at most {MAX_S:.0f} s")
     motion = bridge_motion(scenario, seed, length)
     fixes, at_fixes = gnss_fixes(scenario, seed, length, motion)
     pairs = [accel_samples(a, seed, length, motion) for a in scenario.accels]

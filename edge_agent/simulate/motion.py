@@ -28,10 +28,12 @@ class Truth:
 
 
 def stream(seed: int, part: str) -> np.random.Generator:
+    """The seed's stream of one part: parts do not depend on each other."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, *part.encode()])))
 
 
 def pick(truth: Truth, keep: npt.NDArray[np.bool_]) -> Truth:
+    """The rows of `truth` where `keep`."""
     return Truth(truth.t_ns[keep], truth.d_m[keep], truth.v_mps[keep], truth.a_mps2[keep])
 
 
@@ -39,25 +41,23 @@ class Motion:
     """The true motion as a C2 quintic spline: nodes at `START_NS - lead + k/rate` with d, v, a (n, 3)."""
 
     def __init__(self, start_ns: int, rate_hz: int, d: F64, v: F64, a: F64) -> None:
-        self.start_ns, self.step_ns, h = start_ns, S // rate_hz, 1.0 / rate_hz
-        c1, c2, e1, e2, diff = h * v[:-1], 0.5 * h * h * a[:-1], h * v[1:], 0.5 * h * h * a[1:], d[1:] - d[:-1]
-        self._c = (
-            d[:-1],
-            c1,
-            c2,
-            10 * diff - 6 * c1 - 4 * e1 - 3 * c2 + e2,
-            -15 * diff + 8 * c1 + 7 * e1 + 3 * c2 - 2 * e2,
-            6 * diff - 3 * c1 - 3 * e1 - c2 + e2,
-        )
+        self.start_ns, self.step_ns = start_ns, S // rate_hz
+        self._nodes = d, v, a
 
     def at(self, t_ns: I64) -> Truth:
         """The truth at any instants inside of the record. Raises ValueError outside."""
         k = (t_ns - self.start_ns) // self.step_ns
-        if k.size and (k.min() < 0 or k.max() >= len(self._c[0])):
+        d, v, a = self._nodes
+        if k.size and (k.min() < 0 or k.max() > len(d) - 2):
             raise ValueError("motion: an instant lies outside of the simulated record")
         rate = S / self.step_ns
+        h = 1.0 / rate
         s = ((t_ns - self.start_ns - k * self.step_ns) / self.step_ns)[:, None]
-        c0, c1, c2, c3, c4, c5 = (c[k] for c in self._c)
+        c0, diff = d[k], d[k + 1] - d[k]
+        c1, c2, e1, e2 = h * v[k], 0.5 * h * h * a[k], h * v[k + 1], 0.5 * h * h * a[k + 1]
+        c3 = 10 * diff - 6 * c1 - 4 * e1 - 3 * c2 + e2
+        c4 = -15 * diff + 8 * c1 + 7 * e1 + 3 * c2 - 2 * e2
+        c5 = 6 * diff - 3 * c1 - 3 * e1 - c2 + e2
         d = c0 + s * (c1 + s * (c2 + s * (c3 + s * (c4 + s * c5))))
         v = (c1 + s * (2 * c2 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))) * rate
         a = (2 * c2 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))) * rate * rate

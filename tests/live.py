@@ -1,0 +1,208 @@
+"""Helpers of tests that run a whole Agent: in-memory ports that play a script, an agent in a thread, reading back."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from edge_agent import assemble, config, runtime
+from edge_agent.messages import Config, Fault, Raw
+from edge_agent.recording import topics
+from edge_agent.recording.reader import Stored, read_messages
+from edge_agent.recording.segments import Recorder
+
+PATIENCE_S = 60.0
+"""How long a test waits for what must come; only a broken program or a machine at its end takes so long."""
+
+
+def until(condition: Callable[[], object], what: str) -> None:
+    """Wait until `condition` holds."""
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        if time.monotonic() > end:
+            raise AssertionError(f"waited {PATIENCE_S:g} s in vain: {what}")
+        time.sleep(0.002)
+
+
+class ScriptedPort:
+    """A port that hands out what the test pushes, in lockstep: `push` returns when the reader has offered it."""
+
+    def __init__(self) -> None:
+        self.counters: dict[str, int] = {"opens": 0, "closes": 0}
+        self.refuse: deque[OSError] = deque()  # what the next calls of open raise
+        self._items: deque[list[tuple[int, Any]] | Exception] = deque()
+        self._change = threading.Condition()
+        self._handed = False  # something was handed out and the reader has not come back for more
+
+    def open(self) -> None:
+        self.counters["opens"] += 1
+        if self.refuse:
+            raise self.refuse.popleft()
+
+    def read(self) -> list[tuple[int, Any]]:
+        with self._change:
+            self._handed = False
+            self._change.notify_all()
+            if not self._items:
+                self._change.wait(0.05)
+            if not self._items:
+                return []
+            self._handed = True
+            item = self._items.popleft()
+        if isinstance(item, Exception):
+            raise item
+        return item
+
+    def close(self) -> None:
+        self.counters["closes"] += 1
+
+    def push(self, *items: tuple[int, Any]) -> None:
+        """One read's worth."""
+        with self._change:
+            self._items.append(list(items))
+            self._change.notify_all()
+            done = self._change.wait_for(lambda: not self._items and not self._handed, PATIENCE_S)
+        if not done:
+            raise AssertionError("nobody reads this port")
+
+    def fail(self, error: Exception) -> None:
+        """The next read raises."""
+        with self._change:
+            self._items.append(error)
+            self._change.notify_all()
+
+
+class Live:
+    """An Agent in a thread. Leaving the context stops it and raises what it raised."""
+
+    def __init__(
+        self,
+        settings: Config,
+        ports: Mapping[str, Any],
+        *,
+        free_bytes: Callable[[], int] = lambda: 1 << 40,
+        run_id: str = "test",
+        found: Sequence[Fault] = (),
+        make_recorder: Callable[..., Recorder] = Recorder,
+    ) -> None:
+        data_dir = Path(settings.data_dir)
+        data_dir.mkdir(parents=True, exist_ok=True)
+        attachments = {"config.yaml": settings.text.encode(), **dict(settings.files)}
+        recorder = make_recorder(
+            data_dir, settings.record, settings.site, runtime.run_metadata(settings, run_id), attachments, free_bytes
+        )
+        self.said: list[str] = []
+        self.agent = runtime.Agent(settings, assemble.pipeline(settings), ports, recorder, self.said.append)
+        self.ports = ports
+        self.put = {"inbox": 0, "outbox": 0}
+        self.taken = {"inbox": 0, "outbox": 0}
+        self._count(self.agent.inbox, self.agent, "_arrived", "inbox")
+        self._count(self.agent.outbox, self.agent.writer, "_one", "outbox")
+        self.failure: BaseException | None = None
+        self._found = found
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _count(self, queue: Any, taker: Any, method: str, name: str) -> None:
+        """Count what goes into a queue and what has been dealt with, so that a test can wait for both to be equal."""
+        put, take = queue.put, getattr(taker, method)
+
+        def counted_put(*args: Any) -> bool:
+            good = put(*args)
+            self.put[name] += good
+            return bool(good)
+
+        def counted_take(*args: Any) -> None:
+            take(*args)
+            self.taken[name] += 1
+
+        queue.put = counted_put
+        setattr(taker, method, counted_take)
+
+    def _run(self) -> None:
+        try:
+            self.agent.run(self._found)
+        except BaseException as e:  # noqa: BLE001 - raised again where the test leaves the context
+            self.failure = e
+
+    def __enter__(self) -> Live:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.agent.stop.set()
+        self._thread.join(PATIENCE_S)
+        if error is None:
+            if self.failure is not None:
+                raise self.failure
+            assert not self._thread.is_alive()
+
+    def play(self, raws: Iterable[Raw], *, step: bool = False) -> None:
+        """Push each Raw's payload into the port of its source, in order. `step`: main has dealt with each before the
+        next comes."""
+        for raw in raws:
+            self.ports[raw.source].push((raw.t_ns, raw.payload))
+            if step:
+                self.stepped()
+
+    def stepped(self) -> None:
+        """Wait until main has dealt with everything that came."""
+        until(lambda: self.taken["inbox"] == self.put["inbox"], "an idle main thread")
+
+    def crash(self) -> BaseException:
+        """Wait until the agent has ended by itself; what it raised, which is then settled."""
+        until(lambda: self.failure, "the agent's end")
+        failure, self.failure = self.failure, None
+        assert failure is not None
+        return failure
+
+    def settle(self) -> None:
+        """Wait until main and the writer have dealt with everything that came."""
+        self.stepped()
+        until(lambda: self.taken["outbox"] == self.put["outbox"], "an idle writer")
+
+
+def parse(text: str, folder: Path, files: Mapping[str, bytes] | None = None) -> Config:
+    """A configuration whose files are given; its data_dir is relative to `folder`."""
+    return config.parse(text, folder, None if files is None else lambda name: files[name])
+
+
+def recordings(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.name.endswith((".mcap", ".mcap.part")))
+
+
+def stored(files: Iterable[Path], *wanted: str) -> list[Stored]:
+    """Messages of the topics in file order, all if none is named."""
+    return [s for f in files for s in read_messages(f, set(wanted) or None)]
+
+
+def decoded(files: Iterable[Path], topic: str) -> list[dict[str, Any]]:
+    return [topics.decode(s.schema, s.data) for s in stored(files, topic)]
+
+
+def faults(files: Iterable[Path], kind: str = "") -> list[dict[str, Any]]:
+    return [f for f in decoded(files, "/faults") if not kind or f["kind"] == kind]
+
+
+def values(event: Mapping[str, Any]) -> dict[str, float]:
+    return {v["name"]: v["value"] for v in event["values"]}
+
+
+def raws(files: Iterable[Path]) -> list[Raw]:
+    """Every raw block of the files, in file order."""
+    found = [s for s in stored(files) if s.topic.startswith("/raw/") and s.topic != "/raw/checkpoint"]
+    return [topics.decode_raw(s.topic, s.schema, s.data) for s in found]
+
+
+def ledgers(files: Iterable[Path]) -> dict[str, dict[str, int]]:
+    """The last /diagnostics: port -> its account."""
+    last = decoded(files, "/diagnostics")[-1]
+    return {
+        s["name"].removeprefix("port/"): {v["key"]: int(v["value"]) for v in s["values"]}
+        for s in last["status"]
+        if s["name"].startswith("port/")
+    }
