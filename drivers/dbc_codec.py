@@ -60,6 +60,7 @@ DBC_UNITS = {
 }
 """Units as DBC files write them. Another text there is not judged."""
 
+LARGEST_MPS2 = 1e4  # about 1000 g: no structure lives through it, and such a number is a damaged or misread frame
 SATURATED_PART = 0.999  # of full scale: the last step of a 10-bit converter
 ROTATION_TOLERANCE = 0.01  # rows orthonormal within: 1 % covers matrices written with three decimals
 LEARN_FRAMES = 64  # frames of a set of messages from which the first of the set is learned
@@ -326,6 +327,11 @@ class AccelCodec:
                 self._reject(notes, frames, places[~good], "NOT_FINITE", f"{message.name}: NaN or infinite")
                 places, slots, values = places[good], slots[good], values[good]
                 counter = None if counter is None else counter[good]
+        good = (np.abs(values) <= LARGEST_MPS2 / self._unit).all(axis=1)
+        if not good.all():
+            self._reject(notes, frames, places[~good], "RANGE", f"{message.name}: beyond {LARGEST_MPS2:g} m/s2")
+            places, slots, values = places[good], slots[good], values[good]
+            counter = None if counter is None else counter[good]
         if counter is not None and message.skips:
             good = counter < self._modulus
             if not good.all():

@@ -71,9 +71,13 @@ def _config(args: argparse.Namespace) -> Any:
 
 def _run(args: argparse.Namespace) -> int:
     config = _config(args)
+    from edge_agent.lock import InUseError
     from edge_agent.runtime import run
 
-    return run(config)
+    try:
+        return run(config)
+    except InUseError as e:
+        raise WrongUseError(f"run: {e}") from None
 
 
 def _check(args: argparse.Namespace) -> int:
@@ -101,8 +105,10 @@ def _import(args: argparse.Namespace) -> int:
     config = _config(args) if args.config else None
     try:
         date = datetime.date.fromisoformat(args.date) if args.date else None
+        if date is not None and not 1980 <= date.year < 2100:
+            raise ValueError
     except ValueError:
-        raise WrongUseError(f"--date {args.date}: write YYYY-MM-DD") from None
+        raise WrongUseError(f"--date {args.date}: write YYYY-MM-DD, 1980 to 2099") from None
     nmea = [_port_and_file(text, "gnss") for text in args.nmea]
     can = []
     for text in args.can:
@@ -154,16 +160,16 @@ def _port_and_file(text: str, default: str) -> tuple[str, Path]:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    if args.set and not args.config:
-        raise WrongUseError("replay: --set needs -c: an override changes a configuration")
     if args.output is None and not args.verify:
         raise WrongUseError("replay: give -o OUT for a new recording, --verify to compare, or both")
     config = _config(args) if args.config else None
     from edge_agent.config import ConfigError
     from edge_agent.recording.reader import DamagedError
-    from edge_agent.replay import ReplayError, replay
+    from edge_agent.replay import ReplayError, in_order, recorded_config, replay
 
     try:
+        if args.set and config is None:
+            config = recorded_config(in_order(args.inputs)[0], args.set)
         report = replay(args.inputs, args.output, config, args.verify)
     except (ReplayError, ConfigError) as e:
         raise WrongUseError(f"replay: {e}") from None
@@ -214,13 +220,28 @@ def _cat(args: argparse.Namespace) -> int:
 
 
 def _recover(args: argparse.Namespace) -> int:
+    from edge_agent.lock import NAME, InUseError, hold
     from edge_agent.recording.repair import recover, repair
+    from edge_agent.recording.writer import PART
+    from edge_agent.replay import ended
 
     done = []
     for path in args.paths:
-        if not path.is_dir() and not path.name.endswith(".mcap.part"):
-            raise WrongUseError(f"recover: {path} is neither a folder nor a torn recording (*.mcap.part)")
-        done += recover(path) if path.is_dir() else [repair(path)]
+        if not path.is_dir() and not path.name.endswith((".mcap.part", ".mcap")):
+            raise WrongUseError(f"recover: {path} is neither a folder nor a recording (*.mcap.part, *.mcap)")
+        folder = path if path.is_dir() else path.parent
+        try:
+            held = hold(folder) if (folder / NAME).exists() else None  # a folder that an agent once wrote into
+        except InUseError as e:
+            raise WrongUseError(f"recover: {e}") from None
+        if path.is_dir():
+            done += recover(path, thorough=True)
+        elif path.name.endswith(PART):
+            done.append(repair(path, thorough=True))
+        elif not ended(path):  # a cut file under its final name, e.g. one that was copied while it was written
+            done.append(repair(path.rename(path.with_name(path.name + PART)), thorough=True))
+        if held is not None:
+            os.close(held)
     result = [
         {"file": str(r.path), "what": r.what, "messages": r.messages, "lost_bytes": r.lost_bytes, "detail": r.detail}
         for r in done
@@ -245,7 +266,7 @@ def _simulate(args: argparse.Namespace) -> int:
     try:
         record = simulate(args.scenario, args.seed, args.seconds)
     except ValueError as e:
-        raise WrongUseError(f"simulate: {e}") from None
+        raise WrongUseError(str(e)) from None
     for path in write_files(record, args.output):
         print(path)
     return GOOD

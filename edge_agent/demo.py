@@ -365,7 +365,7 @@ def draw(path: Path, seen: Seen, record: SimRecord, figures: Figures) -> None:
     from matplotlib import pyplot as plt
 
     end = float(max(seen.t_s[-1], OUTAGE.start_s))
-    grid = np.arange(0.0, end, 0.01)
+    grid = np.arange(0.0, float(seen.t_s[-1]), 0.01)  # a short run ends before its last fault
     truth = truth_at(record, grid) * 1e3
     figure, axes = plt.subplot_mosaic(
         [["z", "z"], ["error", "error"], ["wrong", "outage"], ["x", "y"]],

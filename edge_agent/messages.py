@@ -187,18 +187,6 @@ class Fault:
     values: tuple[tuple[str, float], ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Loss:
-    """Items lost between `begin_ns` and `end_ns` (monotonic) at `where` ("kernel", "inbox", "outbox", "disk")."""
-
-    t_ns: int
-    where: str
-    source: str  # port or topic
-    count: int
-    begin_ns: int
-    end_ns: int
-
-
 # -------------------------------------------------------------------------------------------------------------- fused
 
 
@@ -303,6 +291,7 @@ class Rotate:
     checkpoint: Record
     utc_ns: int
     reason: str
+    sync: bool = True  # the wall clock is disciplined: only then may recordings be deleted for their age
 
 
 # ----------------------------------------------------------------------------------------------------------- settings

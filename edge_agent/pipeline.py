@@ -120,7 +120,7 @@ class Pipeline:
         out.append(topics.raw_record(raw, self._log))
         if not isinstance(raw.payload, m.Tick):  # Ticks may come before there is a file that keeps events
             for event in self._drain_events():
-                self._event(out, event)
+                self._event(out, event if event.t_ns else replace(event, t_ns=raw.t_ns))  # adopted before any time
             if isinstance(raw.payload, m.CanFrames):
                 self._can(out, raw, raw.payload)
             else:
@@ -313,7 +313,9 @@ class Pipeline:
         self.rotate_due = None
         self._log = max(self._log, t_ns + self._offset)
         data = topics.checkpoint(self.order, t_ns, t_ns + self._offset, self.save(), reason)
-        return m.Rotate(m.Record("/raw/checkpoint", self._log, self._log, data, False), self._log, reason)
+        return m.Rotate(
+            m.Record("/raw/checkpoint", self._log, self._log, data, False), self._log, reason, self.wall.sync
+        )
 
     @property
     def segment_utc_ns(self) -> int:
@@ -414,11 +416,18 @@ class Pipeline:
     def adopt(self, data: bytes) -> None:
         """Begin a new run with what an earlier one learned; events in the first segment say what was adopted.
 
-        Raises ValueError if the bytes are damaged. Settings in the configuration win over what was learned.
+        Raises ValueError if the bytes are damaged; this pipeline must then not be used. Settings in the configuration
+        win over what was learned.
         """
         s = unpack(data)
         if not isinstance(s, dict) or s.get("version") != STATE_VERSION:
             raise ValueError(f"kept state: version {STATE_VERSION} expected")
+        try:
+            self._adopt(s)
+        except (AttributeError, IndexError, KeyError, TypeError) as e:
+            raise ValueError(f"kept state: damaged ({type(e).__name__}: {e})") from None
+
+    def _adopt(self, s: m.State) -> None:
         same_axes = s["axes"] == self.config.structure.azimuth_deg
         for k, r in self.receivers.items():
             kept = s["receivers"].get(k)
@@ -438,7 +447,7 @@ class Pipeline:
 
     def _adopted(self, source: str, what: str, values: tuple[tuple[str, float], ...]) -> None:
         text = f"{what} of an earlier run adopted: " + ", ".join(f"{n} {v:.9g}" for n, v in values)
-        self._pending_events.append(m.Event(self._now, "ADOPTED", source, text, values))
+        self._pending_events.append(m.Event(0, "ADOPTED", source, text, values))
 
     def counters(self) -> dict[str, dict[str, int]]:
         """Counters of every codec by the name of its receiver or accelerometer."""
@@ -450,5 +459,5 @@ class Pipeline:
 def fingerprint(config: m.Config) -> str:
     """Hash of every setting that the derived bytes depend on; not of paths, retention or the site's name."""
     parts: list[Any] = [config.structure, config.fusion, config.record.view_hz, config.record.accel_block]
-    parts += [sorted(x.items()) for x in (config.receivers, config.accelerometers, config.points)]
+    parts += [list(x.items()) for x in (config.receivers, config.accelerometers, config.points)]  # their order counts
     return hashlib.sha256(repr(parts).encode()).hexdigest()

@@ -23,7 +23,7 @@ from edge_agent import assemble, config
 from edge_agent import messages as m
 from edge_agent.pipeline import Pipeline
 from edge_agent.recording import topics
-from edge_agent.recording.reader import Stored, read_attachments, read_messages, read_metadata
+from edge_agent.recording.reader import MAGIC, Stored, read_attachments, read_messages, read_metadata
 from edge_agent.recording.writer import PART, RUN_METADATA, SegmentWriter, fsync_folder
 
 CHECKPOINT = "/raw/checkpoint"
@@ -95,26 +95,33 @@ def replay(inputs: Sequence[Path], output: Path | None, settings: m.Config | Non
 
 
 def in_order(inputs: Sequence[Path]) -> list[Path]:
-    """Recordings among `inputs`, folders expanded, oldest first by their first message."""
-    found: list[tuple[int, str, Path]] = []
+    """Recordings among `inputs`, folders expanded: runs by their first message, files of a run by their number.
+
+    Not by log time alone: a clock that was set back would put later files of a run first.
+    """
+    found: list[tuple[int, str, int, Path]] = []
     for path in inputs:
         if path.is_dir():
             names = [p for p in sorted(path.iterdir()) if p.name.endswith((".mcap", ".mcap" + PART))]
         else:
             names = [path]
         for p in names:
-            if p.stat().st_size == 0:  # killed as it was made
-                continue
-            first = next(read_messages(p), None)
+            first = None if p.stat().st_size == 0 else next(read_messages(p), None)  # empty: killed as it was made
             if first is not None:
-                found.append((first.log_ns, p.name, p))
+                run = read_metadata(p).get(RUN_METADATA, {})
+                number = run.get("segment", "")
+                found.append((first.log_ns, run.get("run", ""), int(number) if number.isdecimal() else 0, p))
     if not found:
         raise ReplayError(f"no recording with messages in {', '.join(map(str, inputs)) or 'nothing'}")
-    return [p for _, _, p in sorted(found)]
+    begin: dict[str, int] = {}
+    for log_ns, run_id, _, _ in found:
+        begin[run_id] = min(log_ns, begin.get(run_id, log_ns))
+    found.sort(key=lambda f: (begin[f[1]], f[1], f[2], f[3].name) if f[1] else (f[0], "", 0, f[3].name))
+    return [p for _, _, _, p in found]
 
 
-def recorded_config(path: Path) -> m.Config:
-    """The configuration that is attached to a recording. ReplayError without one."""
+def recorded_config(path: Path, sets: Sequence[str] = ()) -> m.Config:
+    """The configuration that is attached to a recording, with `path=value` overrides. ReplayError without one."""
     files = {a.name: a.data for a in read_attachments(path)}
     if CONFIG_NAME not in files:
         raise ReplayError(f"{path} holds no {CONFIG_NAME}: give one with -c")
@@ -124,7 +131,7 @@ def recorded_config(path: Path) -> m.Config:
             raise FileNotFoundError(2, "not attached to the recording", name)
         return files[name]
 
-    return config.parse(files[CONFIG_NAME].decode(), Path(), read)
+    return config.parse(files[CONFIG_NAME].decode(), Path(), read, sets)
 
 
 class _Replay:
@@ -184,6 +191,8 @@ class _Replay:
             self.report.same_platform &= not here or here == assemble.platform_name()
             self.new_run = i > 0 and ids[i] != ids[i - 1]
             last_raw_log = self._segment(path)
+            if not ended(path):
+                self.report.note(f"{path.name} was torn or is being written: what it holds up to there was replayed")
             if i + 1 == len(self.files) or ids[i + 1] != ids[i]:
                 self._out(self.pipeline.finish())
             self._settle(last_raw_log)
@@ -206,7 +215,8 @@ class _Replay:
     def _checkpoint(self, stored: Stored, path: Path) -> None:
         point = topics.decode_checkpoint(stored.data)
         self._settle(None)
-        goes_on = not self.fresh and not self.new_run and point.order == self.pipeline.order
+        another = self.new_run or point.order < self.pipeline.order
+        goes_on = not self.fresh and not another and point.order == self.pipeline.order
         self.new_run = False
         if goes_on and (self.own_state or not self.blind):
             rotate = self.pipeline.rotate(point.reason, point.monotonic_ns)
@@ -215,6 +225,8 @@ class _Replay:
                 self.report.note(f"{path.name}: the state at its checkpoint is not the one that replay reached")
             self._write(rotate.checkpoint)
             return
+        if not self.fresh and not another:
+            self.report.note(f"{path.name}: segments of this run are missing before it")
         if not self.fresh:  # another run, or segments are missing between
             self.pipeline = assemble.pipeline(self.settings)
         self.blind = False
@@ -338,6 +350,13 @@ class _Replay:
         if event["kind"] == "LOSS":
             begin, end = (event[k]["sec"] * m.S + event[k]["nanosec"] for k in ("begin", "end"))
             self.losses.append((event["source"], begin, end))
+
+
+def ended(path: Path) -> bool:
+    """Whether a file has its footer."""
+    with open(path, "rb") as f:
+        f.seek(-len(MAGIC), 2)
+        return f.read() == MAGIC
 
 
 def close(schema: str, a: bytes, b: bytes) -> bool:

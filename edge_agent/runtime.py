@@ -30,8 +30,9 @@ from typing import Protocol
 import numpy as np
 
 import drivers
-from edge_agent import assemble
+from edge_agent import assemble, lock
 from edge_agent import messages as m
+from edge_agent.notify import Notifier
 from edge_agent.pipeline import Pipeline
 from edge_agent.queues import ByteQueue
 from edge_agent.recording import topics
@@ -73,6 +74,13 @@ class Keep:
     data: bytes
 
 
+@dataclass(frozen=True, slots=True)
+class Beat:
+    """A Tick has come through the inbox and main: once the writer has it too, the supervisor is told."""
+
+    lines: tuple[str, ...]
+
+
 class Account:
     """Ledger of one port: received = written + queued + dropped + refused + lost; one thread writes each counter."""
 
@@ -91,7 +99,6 @@ class Reader(threading.Thread):
     def __init__(self, name: str, port: Port, inbox: ByteQueue[Arrival], account: Account, stop: threading.Event):
         super().__init__(name=f"read-{name}", daemon=True)
         self.source, self.port, self.inbox, self.account, self.stopping = name, port, inbox, account, stop
-        self.opened = threading.Event()
         self.failure: BaseException | None = None
 
     def run(self) -> None:
@@ -107,7 +114,6 @@ class Reader(threading.Thread):
         while not self.stopping.is_set():
             try:
                 self.port.open()
-                self.opened.set()
                 if lost:
                     self._fault("PORT_OPEN", "open again")
                 while not self.stopping.is_set():
@@ -148,13 +154,15 @@ class Writer(threading.Thread):
 
     def __init__(
         self,
-        outbox: ByteQueue[m.Record | m.Rotate | Keep],
+        outbox: ByteQueue[m.Record | m.Rotate | Keep | Beat],
         recorder: Recorder,
         settings: m.RecordSettings,
         state_path: Path,
         accounts: Mapping[str, Account],
+        notifier: Notifier,
     ) -> None:
         super().__init__(name="writer", daemon=True)
+        self.notifier = notifier
         self.outbox, self.recorder, self.settings, self.state_path = outbox, recorder, settings, state_path
         self.accounts = accounts
         self.failure: BaseException | None = None
@@ -165,7 +173,7 @@ class Writer(threading.Thread):
         self.lost: dict[str, list[int]] = {}  # topic -> [count, first log_time, last log_time]
         self.lock = threading.Lock()
         self._rotates = 0
-        self._ring: deque[m.Record | m.Rotate] = deque()  # empty or a Rotate and what follows it
+        self._ring: deque[m.Record | m.Rotate] = deque()  # empty, or begins with a Rotate
         self._ring_bytes = 0
         self._told = False  # of the disk's refusal
         self._retry_ns = 0
@@ -192,9 +200,12 @@ class Writer(threading.Thread):
         except RecordingError as e:
             self._failed(e, now)
 
-    def _one(self, item: m.Record | m.Rotate | Keep, now: int) -> None:
+    def _one(self, item: m.Record | m.Rotate | Keep | Beat, now: int) -> None:
         if isinstance(item, Keep):
             self._keep(item.data, now)
+            return
+        if isinstance(item, Beat):
+            self.notifier.send("WATCHDOG=1", *item.lines)
             return
         self._rotates += isinstance(item, m.Rotate)
         if not self.holding:
@@ -240,30 +251,31 @@ class Writer(threading.Thread):
         self._retry_ns = now + RETRY_NS
 
     def _hold(self, item: m.Record | m.Rotate, now: int) -> None:
-        """Keep for later what follows the newest Rotate; without one, or over the bound, it is lost and counted."""
+        """Keep for later what follows a Rotate; over the bound the oldest segment is lost, and counted."""
         bound = self.settings.ring_mb * MB
-        if isinstance(item, m.Rotate):
-            self._drop_ring()
-            self._ring.append(item)
-            self._ring_bytes = len(item.checkpoint.data)
+        size = held_size(item)
+        if isinstance(item, m.Record) and item.derived and self._ring_bytes + size > DERIVED_SHARE * bound:
+            self._lose(item)
             return
-        size = len(item.data) + RECORD_OVERHEAD
-        if not self._ring or (item.derived and self._ring_bytes + size > DERIVED_SHARE * bound):
-            self._lose(item)
-        elif self._ring_bytes + size > bound:
-            self.want_rotate = True  # a file can only begin at a checkpoint
-            self._drop_ring()
-            self._lose(item)
+        if self._ring and self._ring_bytes + size > bound:
+            self._drop_oldest()
+            if not self._ring and isinstance(item, m.Record):
+                self.want_rotate = True  # a file can only begin at a checkpoint
             self.faults.append(m.Fault(now, "recorder", "RING_FULL", "the disk still refuses; held records are lost"))
-        else:
+        if self._ring or isinstance(item, m.Rotate):
             self._ring.append(item)
             self._ring_bytes += size
+        else:
+            self._lose(item)
 
-    def _drop_ring(self) -> None:
-        for old in self._ring:
-            self._lose(old)
-        self._ring.clear()
-        self._ring_bytes = 0
+    def _drop_oldest(self) -> None:
+        """Lose the ring's first Rotate and what follows it up to the next."""
+        while self._ring:
+            item = self._ring.popleft()
+            self._ring_bytes -= held_size(item)
+            self._lose(item)
+            if self._ring and isinstance(self._ring[0], m.Rotate):
+                return
 
     def _resume(self, now: int) -> None:
         held, self._ring, self._ring_bytes = list(self._ring), deque(), 0
@@ -308,6 +320,11 @@ class Writer(threading.Thread):
             os.replace(temporary, self.state_path)
         except OSError as e:
             self.faults.append(m.Fault(now, "state", "STATE_NOT_KEPT", f"{self.state_path}: {e.strerror or e}"))
+
+
+def held_size(item: m.Record | m.Rotate) -> int:
+    """Bytes that an item costs while it is held."""
+    return len(item.checkpoint.data if isinstance(item, m.Rotate) else item.data) + RECORD_OVERHEAD
 
 
 def note_loss(lost: dict[str, list[int]], record: m.Record) -> None:
@@ -367,15 +384,19 @@ class Agent:
         ports: Mapping[str, Port],
         recorder: Recorder,
         say: Callable[[str], None],
+        notifier: Notifier | None = None,
     ) -> None:
         self.config, self.pipeline, self.recorder, self._print = config, pipeline, recorder, say
         self.stop = threading.Event()
         record = config.record
         self.inbox: ByteQueue[Arrival] = ByteQueue(int(record.inbox_mb * MB))
-        self.outbox: ByteQueue[m.Record | m.Rotate | Keep] = ByteQueue(int(record.outbox_mb * MB))
+        self.outbox: ByteQueue[m.Record | m.Rotate | Keep | Beat] = ByteQueue(int(record.outbox_mb * MB))
         self.accounts = {name: Account() for name in ports}
         state_path = Path(config.data_dir) / STATE_FILE
-        self.writer = Writer(self.outbox, recorder, record, state_path, self.accounts)
+        self.notifier = notifier or Notifier(None)
+        self.writer = Writer(self.outbox, recorder, record, state_path, self.accounts, self.notifier)
+        self._beats = 0
+        self._synced = True  # only what differs is said
         self.readers = {n: Reader(n, p, self.inbox, self.accounts[n], self.stop) for n, p in ports.items()}
         self._head: list[m.Record] = []  # what came before the first file
         self._open = False
@@ -403,6 +424,8 @@ class Agent:
         finally:
             self.outbox.close()
             self.writer.join()
+            for f in self.writer.faults:
+                self._print(f"{f.source}: {f.kind}: {f.text}")
             for topic, (count, _, _) in self.writer.lost.items():
                 self._print(f"lost at the disk, and told in no file: {count} of {topic}")
         if self.writer.failure is not None:
@@ -428,6 +451,7 @@ class Agent:
             self._failures(everyone)
             if self.stop.is_set():
                 break
+        self.notifier.send("STOPPING=1")
         for reader in everyone:
             if reader.ident is not None:
                 reader.join(timeout=5.0)
@@ -520,9 +544,9 @@ class Agent:
                 self._own("/tf_static", topics.tf_static(tf, self._stamp))
                 return
 
-    def _put(self, item: m.Record | Keep) -> None:
-        if isinstance(item, Keep):
-            self.outbox.put(item, len(item.data), float("inf"))
+    def _put(self, item: m.Record | Keep | Beat) -> None:
+        if isinstance(item, (Keep, Beat)):
+            self.outbox.put(item, len(item.data) if isinstance(item, Keep) else 0, float("inf"))
             return
         if not self._open:
             if not item.derived:
@@ -557,6 +581,7 @@ class Agent:
         stamp = self._stamped(end_ns)
         to_utc = self.pipeline.to_utc
         text = f"{count} lost at {where}"
+        self._print(f"{source}: LOSS: {text}")
         values = (("count", float(count)),)
         self._own(
             "/faults", topics.event("LOSS", source, text, values, end_ns, stamp, to_utc(begin_ns), to_utc(end_ns))
@@ -585,6 +610,10 @@ class Agent:
             self.fault(self.writer.faults.popleft())
         if self.outbox.bytes < DERIVED_SHARE * self.outbox.limit_bytes:
             self._tell_losses()
+        if self.pipeline.wall.sync != self._synced:
+            self._synced = self.pipeline.wall.sync
+            words = "is disciplined" if self._synced else "is NOT disciplined: fix times rest on the assumed latency"
+            self.say(INFO if self._synced else WARNING, f"clock: the host's clock {words}")
         counters = self.pipeline.counters()
         for port, watch in self._watch.items():
             names = self._listeners(port)
@@ -598,6 +627,9 @@ class Agent:
             if told:
                 self.fault(m.Fault(t_ns, port, told[0], told[1]))
         self._own("/diagnostics", topics.diagnostics(self._statuses(counters), self._stamp))
+        states = ", ".join(f"{port} {watch.state}" for port, watch in self._watch.items())
+        self._beats += 1  # at the second one, every port has been tried
+        self._put(Beat((*(("READY=1",) if self._beats == 2 else ()), f"STATUS={states or 'no sensors'}")))
 
     def _statuses(self, counters: Mapping[str, Mapping[str, int]]) -> list[topics.Status]:
         status = topics.Status
@@ -619,7 +651,7 @@ class Agent:
             found.append(status(level, f"port/{name}", state, {k: str(v) for k, v in ledger.items()}))
         for name, count in counters.items():
             found.append(status(0, f"codec/{name}", "", {k: str(v) for k, v in count.items()}))
-        free = shutil.disk_usage(self._existing_dir()).free
+        free = free_bytes(Path(self.config.data_dir))
         wall = self.pipeline.wall
         values = {
             "inbox_bytes": str(self.inbox.bytes),
@@ -630,14 +662,18 @@ class Agent:
             "clock_sync": str(int(wall.sync)),
             "clock_error_ns": str(wall.error_ns),
         }
-        found.append(status(0, "agent", "", values))
+        found.append(status(0 if wall.sync else 1, "agent", "" if wall.sync else "clock not disciplined", values))
         return found
 
-    def _existing_dir(self) -> Path:
-        path = Path(self.config.data_dir)
+
+def free_bytes(path: Path) -> int:
+    """Free space of the file system that holds `path`, or its nearest parent that exists; -1 where it does not say."""
+    try:
         while not path.exists():
             path = path.parent
-        return path
+        return shutil.disk_usage(path).free
+    except OSError:
+        return -1
 
 
 def resident_bytes() -> int:
@@ -667,19 +703,22 @@ def run(config: m.Config) -> int:
         print(text, file=sys.stderr, flush=True)
 
     data_dir = Path(config.data_dir)
-    data_dir.mkdir(parents=True, exist_ok=True)
-    recovered = recover(data_dir)
     pipeline = assemble.pipeline(config)
     now = time.monotonic_ns()
-    found: list[m.Fault] = [
-        m.Fault(now, "recorder", "RECOVERED", f"{r.path.name}: {r.what}, {r.messages} messages kept {r.detail}".strip())
-        for r in recovered
-    ]
+    found: list[m.Fault] = []
+    try:
+        lock.hold(data_dir)  # before anything there is touched
+        for r in recover(data_dir):
+            text = f"{r.path.name}: {r.what}, {r.messages} messages kept {r.detail}".strip()
+            found.append(m.Fault(now, "recorder", "RECOVERED", text))
+    except OSError as e:  # the card may come back; until then records wait in memory
+        found.append(m.Fault(now, "recorder", "DISK_IO", f"data_dir {data_dir}: {e.strerror or e}"))
     kept = data_dir / STATE_FILE
     if kept.exists():
         try:
             pipeline.adopt(kept.read_bytes())
-        except (OSError, ValueError, KeyError, TypeError) as e:
+        except (OSError, ValueError) as e:
+            pipeline = assemble.pipeline(config)
             aside = kept.with_suffix(".refused")
             with suppress(OSError):
                 os.replace(kept, aside)
@@ -689,10 +728,8 @@ def run(config: m.Config) -> int:
     ports["clock"] = make(drivers.PORTS, "clock")(m.PortSettings("clock", "clock"))
     attachments = {"config.yaml": config.text.encode(), **dict(config.files)}
     metadata = run_metadata(config, os.urandom(8).hex())
-    recorder = Recorder(
-        data_dir, config.record, config.site, metadata, attachments, lambda: shutil.disk_usage(data_dir).free
-    )
-    agent = Agent(config, pipeline, ports, recorder, say)
+    recorder = Recorder(data_dir, config.record, config.site, metadata, attachments, lambda: free_bytes(data_dir))
+    agent = Agent(config, pipeline, ports, recorder, say, Notifier(os.environ.get("NOTIFY_SOCKET")))
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         agent.stop.set()

@@ -20,13 +20,13 @@ PATIENCE_S = 60.0
 """How long a test waits for what must come; only a broken program or a machine at its end takes so long."""
 
 
-def until(condition: Callable[[], object], what: str) -> None:
+def until(condition: Callable[[], object], what: str, poll_s: float = 0.002) -> None:
     """Wait until `condition` holds."""
     end = time.monotonic() + PATIENCE_S
     while not condition():
         if time.monotonic() > end:
             raise AssertionError(f"waited {PATIENCE_S:g} s in vain: {what}")
-        time.sleep(0.002)
+        time.sleep(poll_s)
 
 
 class ScriptedPort:
@@ -159,6 +159,16 @@ class Live:
         failure, self.failure = self.failure, None
         assert failure is not None
         return failure
+
+    def balance(self) -> dict[str, str]:
+        """After the end: ports whose account does not balance, or says something else than the files do."""
+        there = [r.source for r in raws(recordings(self.agent.recorder.data_dir))]
+        wrong = {}
+        for name, a in self.agent.accounts.items():
+            if a.received != a.written + a.dropped + a.refused + a.lost or a.written != there.count(name):
+                said = f"received {a.received}, written {a.written}, dropped {a.dropped}, refused {a.refused}"
+                wrong[name] = f"{said}, lost {a.lost}; in the files {there.count(name)}"
+        return wrong
 
     def settle(self) -> None:
         """Wait until main and the writer have dealt with everything that came."""

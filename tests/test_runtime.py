@@ -105,6 +105,7 @@ def test_what_the_ports_said_is_recorded_in_order_and_fused_as_the_pipeline_alon
     for ledger in ledgers(files).values():
         assert balanced(ledger)
     assert ledgers(files)[CAN]["received"] > 300
+    assert live.balance() == {}
 
 
 def test_what_was_found_before_the_start_is_recorded_with_a_time(script: list[Raw], tmp_path: Path) -> None:
@@ -163,7 +164,7 @@ def test_files_end_at_the_size(script: list[Raw], tmp_path: Path) -> None:
     *files, last = recordings(tmp_path / "rec")
     assert len(files) >= 2
     for f in files:
-        assert 100_000 <= f.stat().st_size < 300_000  # 2 s of data later at the latest, and never twice
+        assert f.stat().st_size >= 100_000  # none was ended twice
     report = replay([*files, last], None, None, True)
     assert report.ok, str(report)
     assert report.compared == report.derived
@@ -182,11 +183,26 @@ def test_the_size_of_the_file_before_does_not_end_the_next_one(script: list[Raw]
             lambda self: published[0], lambda self, value: None
         )
         try:
-            live.play(script[100:160])
+            live.play(script[100:160], step=True)
         finally:
             del type(live.agent.writer).open_file
             live.agent.writer.open_file = number, 0
     assert len(recordings(tmp_path / "rec")) == 2
+
+
+def test_what_waits_for_time_to_go_on_is_in_the_file_of_its_run(script: list[Raw], tmp_path: Path) -> None:
+    bad = b"$GNGGA,1,2,3*00\r\n"
+    for run_id, part in (("one", script[:100]), ("two", script[100:200])):
+        with Live(settings(tmp_path), ports(), run_id=run_id) as live:
+            live.play([tick(part[0].t_ns), *part, Raw(part[-1].t_ns, 0, GNSS, bad)])
+        (last,) = [e for e in decoded(recordings(tmp_path / "rec")[-1:], "/events") if e["kind"] == "REJECT"]
+        assert last["text"].startswith("CHECKSUM")  # told at the stop, less than a second after it came
+    files = recordings(tmp_path / "rec")
+    assert len(files) == 2
+    for some in (files, files[:1], files[1:]):
+        report = replay(some, None, None, True)
+        assert report.ok, str(report)
+        assert report.compared == report.derived
 
 
 # -------------------------------------------------------------------------------------------------------------- faults
@@ -379,6 +395,7 @@ def test_a_full_inbox_drops_the_newest_and_says_how_many(script: list[Raw], tmp_
     for name, ledger in ledgers(files).items():
         assert ledger["dropped_inbox"] == by_port[name]
         assert balanced(ledger)
+    assert live.balance() == {}
     report = replay(files, None, None, True)
     assert report.ok, str(report)
     assert report.compared == report.derived
@@ -439,6 +456,7 @@ def test_a_full_outbox_refuses_derived_records_first_and_verify_knows(script: li
         assert balanced(ledger)
         assert ledger["written"] == ledger["received"] - ledger["refused_outbox"] - ledger["queued"]
         assert sum(r.source == name for r in raws(files)) == accounts[name].received - accounts[name].refused
+    assert live.balance() == {}
     report = replay(files, None, None, True)
     assert report.ok, str(report)
     assert (report.missing, report.unexpected, report.raw_gaps) == (0, 0, 0)

@@ -1,4 +1,5 @@
-"""Accelerations into the ring: only newer ones, only complete ones, gaps bridged.
+"""Accelerations into the ring: only newer ones, only complete ones, gaps bridged. A saturated sample says only that
+the motion was beyond the range, so it is left out like one that never came.
 
 A gap is an interval longer than 3.5 usual ones and 50 ms; shorter ones are what a lost frame makes, and a straight line
 across them is better than anything else. Across a gap stands the mean of the last `accel_mean_s`, with white noise
@@ -14,8 +15,9 @@ import numpy as np
 
 from edge_agent.fusion.integrals import CHUNK, NS, SYNTHETIC, Ring
 from edge_agent.fusion.point import Gap, Point
-from edge_agent.messages import F64, I64, AccelBlock, Event, FusionSettings, S
+from edge_agent.messages import F64, I64, AccelBlock, AccelFlag, Event, FusionSettings, S
 
+_SATURATED = np.uint8(AccelFlag.SATURATED)
 NOMINAL = 33
 LEAST_GAP_NS = 50_000_000
 GAPS = 64
@@ -46,8 +48,9 @@ class Feed:
                 continue
             t, a = b.t_ns[lo : lo + CHUNK], b.xyz[lo : lo + CHUNK]
             more = more or len(b.t_ns) > lo + CHUNK
-            if not np.isfinite(a).all():
-                good = np.isfinite(a).all(axis=1)
+            clipped = b.flags[lo : lo + CHUNK] & _SATURATED
+            if clipped.any() or not np.isfinite(a).all():
+                good = np.isfinite(a).all(axis=1) & (clipped == 0)
                 t, a = t[good], a[good]
                 if not len(t):
                     continue

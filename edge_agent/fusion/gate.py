@@ -8,7 +8,7 @@ motion. The offset ends
 - when fixes agree with o = 0 again: four in a row and the likelihood ratio of "o = 0" against "o as estimated" beyond
   e^6 (a small offset fits o = 0 now and then; the ratio tells them apart);
 - after `reacquire_s`: the level is real, d takes it over (DATUM);
-- another level that four refusals agree on replaces it.
+- another level that four refusals agree on replaces it (three levels within moments are none: REACQUIRE).
 
 Refusals that agree on nothing for `lockout_s` mean that the prediction is wrong, not the fixes: the filter begins anew
 at the next one (REACQUIRE), so nothing locks out. After a float spell
@@ -85,6 +85,7 @@ class Gate:
         self.open = False
         self.open_ns = 0
         self.begin_ns = 0  # of the first opening in a run of levels
+        self.quick = 0  # levels found so soon after one another that they are none
         self.history: list[tuple[int, bool, Three, Three]] = []  # t, refused, level, variance of the level
         self.fits_zero = 0
         self.ratio = 0.0
@@ -160,6 +161,11 @@ class Gate:
                 sum(h[2][1] for h in agreeing) / n,
                 sum(h[2][2] for h in agreeing) / n,
             )
+            self.quick = self.quick + 1 if self.open and t_ns - self.open_ns < lockout_ns else 0
+            if self.quick >= 2:
+                # Level after level after level: the prediction runs away, not the receiver.
+                self.forget()
+                return Action.REACQUIRE
             return self._open(t_ns, mean)
         if since_used_ns > lockout_ns and len(self.history) >= AGREE:
             self.forget()
@@ -182,6 +188,7 @@ class Gate:
     def forget(self) -> None:
         """Close without a word and forget the levels seen."""
         self.open = False
+        self.quick = 0
         self.fits_zero = 0
         self.ratio = 0.0
         self.history = []
@@ -203,7 +210,7 @@ class Gate:
 
     def save(self) -> State:
         return {
-            "open": self.open, "open_ns": self.open_ns, "begin_ns": self.begin_ns,
+            "open": self.open, "quick": self.quick, "open_ns": self.open_ns, "begin_ns": self.begin_ns,
             "history": [[h[0], h[1], list(h[2]), list(h[3])] for h in self.history],
             "fits_zero": self.fits_zero, "ratio": self.ratio, "confirm": self.confirm, "confirm_ns": self.confirm_ns,
             "waiting": [[w[0], list(w[1]), list(w[2])] for w in self.waiting],
@@ -211,7 +218,8 @@ class Gate:
         }  # fmt: skip
 
     def load(self, s: State) -> None:
-        self.open, self.open_ns, self.begin_ns = s["open"], s["open_ns"], s["begin_ns"]
+        self.open, self.quick = s["open"], s["quick"]
+        self.open_ns, self.begin_ns = s["open_ns"], s["begin_ns"]
         self.history = [(t, r, _three(a), _three(b)) for t, r, a, b in s["history"]]
         self.fits_zero, self.ratio = s["fits_zero"], s["ratio"]
         self.confirm, self.confirm_ns = s["confirm"], s["confirm_ns"]

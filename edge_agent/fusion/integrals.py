@@ -14,7 +14,7 @@ first sample) is taken off before integration: gravity and bias would only cost 
 
 A gap holds the mean of the last seconds: two synthetic rows (gap's begin, mean) and (its end, mean) make the step
 without a straight line across it. Rows beyond the bound are forgotten, oldest first; the bound is by count and far
-above the worst latency at the rates of structural sensors (4096 rows = 2 s at 2 kHz, 16 s at 250 Hz).
+above the worst latency at the rates of structural sensors (2048 rows = 2 s at 1 kHz, 8 s at 250 Hz).
 """
 
 from __future__ import annotations
@@ -25,6 +25,12 @@ from edge_agent.messages import F64, I64, U8, State
 
 KEEP = 4096
 """Rows kept per point at least, once there have been so many."""
+LATEST = KEEP // 2
+"""A fix may be late by so many rows at most: 2 s at 1 kHz,"""
+LATEST_NS = 12_000_000_000
+"""and by so much. The rest of the rows is for means before it."""
+SAVED_NS = 25_000_000_000
+"""Rows older than this before the newest are not saved: no fix and no mean reaches them."""
 ROWS = 2 * KEEP
 """Rows allocated per point: half of them moves to the front when the end is reached."""
 CHUNK = 1024
@@ -52,8 +58,21 @@ def hold(t: I64, a: F64, g: F64) -> F64:
     return out
 
 
+def bend(t: I64, a: F64) -> F64:
+    """(h x second difference)^2 per axis [m2/s2] of rows a (P, n+2, 3), t (P, n+1) ns from the second on: (P, n, 3).
+
+    A first-order hold across a sample interval misses h/12 of the second difference, so the sum over an interval tells
+    how much velocity may have been missed: nothing for what the sampling resolves, much for a blow.
+    """
+    e = a[:, 2:] - 2.0 * a[:, 1:-1] + a[:, :-2]
+    e *= ((t[:, 1:] - t[:, :-1]) * NS)[:, :, None]
+    e *= e
+    return e
+
+
 class Ring:
-    """Rows of P points: t (P, ROWS) ns, a less reference (P, ROWS, 3), g = (g2, g1) (P, ROWS, 6), kind (P, ROWS).
+    """Rows of P points: t (P, ROWS) ns, a less reference (P, ROWS, 3), g = (g2, g1) (P, ROWS, 6), the running sum of
+    `bend` (P, ROWS, 3) since the origin, kind (P, ROWS).
 
     `head` is the next row to write, `out` the next to be emitted.
     """
@@ -62,6 +81,7 @@ class Ring:
         self.t: I64 = np.zeros((points, ROWS), dtype=np.int64)
         self.a: F64 = np.zeros((points, ROWS, 3))
         self.g: F64 = np.zeros((points, ROWS, 6))
+        self.bent: F64 = np.zeros((points, ROWS, 3))
         self.kind: U8 = np.zeros((points, ROWS), dtype=np.uint8)
         self.head = [0] * points
         self.out = [0] * points
@@ -80,45 +100,50 @@ class Ring:
                 self.first_ns[p] = self.origin_ns[p] = int(t[i, 0])
                 self.reference[p] = a[i, 0]
             elif h + n > ROWS:
-                for rows in (self.t, self.a, self.g, self.kind):
+                for rows in (self.t, self.a, self.g, self.bent, self.kind):
                     rows[p, :KEEP] = rows[p, h - KEEP : h].copy()
                 self.out[p] += KEEP - h
                 self.head[p] = KEEP
         heads = [self.head[p] for p in points]
         h0 = heads[0]
         tt = np.empty((len(points), n + 1), dtype=np.int64)
-        aa = np.empty((len(points), n + 1, 3))
+        aa = np.empty((len(points), n + 2, 3))  # the two rows before, then the new ones
         tt[:, 1:] = t
         k = block(points)
         if isinstance(k, slice) and heads.count(h0) == len(heads):
-            np.subtract(a, self.reference[k, None], out=aa[:, 1:])
+            np.subtract(a, self.reference[k, None], out=aa[:, 2:])
             if h0:
                 tt[:, 0] = self.t[k, h0 - 1]
-                aa[:, 0] = self.a[k, h0 - 1]
-                g = hold(tt, aa, self.g[k, h0 - 1])
+                aa[:, 1] = self.a[k, h0 - 1]
+                aa[:, 0] = self.a[k, h0 - 2] if h0 > 1 else aa[:, 1]
+                g, bent = self.g[k, h0 - 1], self.bent[k, h0 - 1]
             else:
                 tt[:, 0] = t[:, 0]
-                aa[:, 0] = aa[:, 1]
-                g = hold(tt, aa, np.zeros((len(points), 6)))
+                aa[:, :2] = aa[:, 2:3]
+                g, bent = np.zeros((len(points), 6)), np.zeros((len(points), 3))
             w = slice(h0, h0 + n)
             self.t[k, w] = t
-            self.a[k, w] = aa[:, 1:]
-            self.g[k, w] = g[:, 1:]
+            self.a[k, w] = aa[:, 2:]
+            self.g[k, w] = hold(tt, aa[:, 1:], g)[:, 1:]
+            self.bent[k, w] = _sum(bent, bend(tt, aa) if kind is None else np.zeros_like(a))
             self.kind[k, w] = 0 if kind is None else kind
         else:
             index = np.array(points)
             head = np.array(heads)
-            np.subtract(a, self.reference[index, None], out=aa[:, 1:])
-            old = (head > 0)[:, None]
+            np.subtract(a, self.reference[index, None], out=aa[:, 2:])
+            some = (head > 0)[:, None]
             before = np.maximum(head - 1, 0)
-            tt[:, 0] = np.where(old[:, 0], self.t[index, before], t[:, 0])
-            aa[:, 0] = np.where(old, self.a[index, before], aa[:, 1])
-            g = hold(tt, aa, np.where(old, self.g[index, before], 0.0))
+            tt[:, 0] = np.where(some[:, 0], self.t[index, before], t[:, 0])
+            aa[:, 1] = np.where(some, self.a[index, before], aa[:, 2])
+            aa[:, 0] = np.where((head > 1)[:, None], self.a[index, np.maximum(head - 2, 0)], aa[:, 1])
+            g = np.where(some, self.g[index, before], 0.0)
+            bent = np.where(some, self.bent[index, before], 0.0)
             rows = head[:, None] + np.arange(n)
             k2 = index[:, None]
             self.t[k2, rows] = t
-            self.a[k2, rows] = aa[:, 1:]
-            self.g[k2, rows] = g[:, 1:]
+            self.a[k2, rows] = aa[:, 2:]
+            self.g[k2, rows] = hold(tt, aa[:, 1:], g)[:, 1:]
+            self.bent[k2, rows] = _sum(bent, bend(tt, aa) if kind is None else np.zeros_like(a))
             self.kind[k2, rows] = 0 if kind is None else kind
         for i, p in enumerate(points):
             self.head[p] += count[i]
@@ -144,7 +169,12 @@ class Ring:
         return i, a1, out
 
     def covers(self, p: int, t_ns: int) -> bool:
-        return self.head[p] > 0 and int(self.t[p, 0]) <= t_ns <= self.last_ns[p]
+        """Whether a fix at t finds its accelerations: not later than the newest row, not older than LATEST_NS or LATEST
+        rows before it. The bound is tighter than what is kept: a loaded ring answers as the saved one did."""
+        h = self.head[p]
+        if not h or t_ns > self.last_ns[p]:
+            return False
+        return t_ns >= max(int(self.t[p, max(0, h - LATEST)]), self.last_ns[p] - LATEST_NS)
 
     def row(self, p: int, t_ns: int) -> int:
         """First row not before t."""
@@ -157,6 +187,12 @@ class Ring:
         tt = np.concatenate([[t_ns], self.t[p, i + 1 : h]])[None]
         aa = np.concatenate([a[None], self.a[p, i + 1 : h]])[None]
         self.g[p, i + 1 : h] = hold(tt, aa, np.zeros((1, 6)))[0, 1:]
+        if h > i + 1:
+            rows = np.maximum(np.arange(i - 1, h), 0)
+            e = bend(self.t[p, i:h][None], self.a[p, rows][None])
+            e[0, self.kind[p, i + 1 : h] == SYNTHETIC] = 0.0
+            self.bent[p, i + 1 : h] = _sum(np.zeros((1, 3)), e)[0]
+        self.bent[p, i] = 0.0
         # The row before, backwards from the origin: another time may lie between this one and the next row.
         step = (t_ns - int(self.t[p, i])) * NS
         a0 = self.a[p, i]
@@ -165,7 +201,7 @@ class Ring:
         self.g[p, i, :3] = (g1 + (a0 + a0 + a) * (step * (1 / 6))) * -step
         self.origin_ns[p] = t_ns
 
-    def recent(self, p: int, until_ns: int, seconds: float, limit: int = 2048) -> tuple[I64, F64]:
+    def recent(self, p: int, until_ns: int, seconds: float, limit: int = LATEST - 2) -> tuple[I64, F64]:
         """Real rows of the last `seconds` up to `until_ns`, at most `limit` rows: t, a less reference."""
         h = int(self.t[p, : self.head[p]].searchsorted(until_ns, side="right"))
         lo = max(0, h - limit)
@@ -177,11 +213,12 @@ class Ring:
         """Everything that a later step may read: the kept rows, cut to what is in use."""
         rows: list[State] = []
         for p, h in enumerate(self.head):
-            lo = max(0, h - KEEP)
+            lo = max(0, h - KEEP, self.row(p, self.last_ns[p] - SAVED_NS) - 2)
             w = slice(lo, h)
             rows.append(
                 {
-                    "t": self.t[p, w], "a": self.a[p, w], "g": self.g[p, w], "kind": self.kind[p, w],
+                    "t": self.t[p, w], "a": self.a[p, w], "g": self.g[p, w],
+                    "bent": self.bent[p, w], "kind": self.kind[p, w],
                     "out": self.out[p] - lo, "first": self.first_ns[p], "origin": self.origin_ns[p],
                     "reference": self.reference[p],
                 }
@@ -194,6 +231,7 @@ class Ring:
             self.t[p, :n] = r["t"]
             self.a[p, :n] = r["a"]
             self.g[p, :n] = r["g"]
+            self.bent[p, :n] = r["bent"]
             self.kind[p, :n] = r["kind"]
             self.head[p] = n
             self.last_ns[p] = int(r["t"][-1]) if n else -1
@@ -201,6 +239,15 @@ class Ring:
             self.first_ns[p] = r["first"]
             self.origin_ns[p] = r["origin"]
             self.reference[p] = r["reference"]
+
+
+def _sum(begin: F64, steps: F64) -> F64:
+    """Running sum of steps (P, n, 3) from begin (P, 3); the begin is carried in, so the cut does not matter."""
+    out = np.empty((steps.shape[0], steps.shape[1] + 1, 3))
+    out[:, 0] = begin
+    out[:, 1:] = steps
+    out.cumsum(axis=1, out=out)
+    return out[:, 1:]
 
 
 def block(points: list[int]) -> slice | list[int]:

@@ -18,10 +18,11 @@ study; maximum likelihood for q and r after Shan & Qi.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
-from edge_agent.messages import F64, FusionSettings, Quality, State
+from edge_agent.messages import F64, Quality, State
 
 CHI1_MEDIAN = 0.45493642311957283
 """Median of a chi-square of one degree of freedom."""
@@ -80,10 +81,11 @@ R_TINY = 1e-14
 class Bank:
     """Filters over (q/r, qb/r) for P points: states (3, M, P, 3), covariances relative to r as six planes (M, P)."""
 
-    def __init__(self, points: int, settings: FusionSettings) -> None:
-        self.settings = settings
-        rho = [a for a in Q_RATIOS for _ in QB_RATIOS]
-        beta = [b for _ in Q_RATIOS for b in QB_RATIOS]
+    def __init__(
+        self, points: int, q_ratios: Sequence[float] = Q_RATIOS, qb_ratios: Sequence[float] = QB_RATIOS
+    ) -> None:
+        rho = [a for a in q_ratios for _ in qb_ratios]
+        beta = [b for _ in q_ratios for b in qb_ratios]
         self.rho: F64 = np.array(rho)[:, None]
         self.beta: F64 = np.array(beta)[:, None]
         self.log_rho = [math.log(v) for v in rho]
@@ -216,6 +218,83 @@ class Bank:
         self.sum_e, self.sum_l = s["sum_e"].copy(), s["sum_l"].copy()
         self.product, self.count = s["product"].copy(), s["count"].copy()
         self.fresh = list(s["fresh"])
+
+
+class Monitor:
+    """Does the accelerometer help, or does it contradict the fixes?
+
+    Beside the fused filter runs one without accelerations (a small bank: motion by itself, from standing to swinging).
+    Per fix and axis both say how surprised they were, log S + nu^2 / S (clipped, so that an outlier costs both alike).
+    Where the one without has been less surprised by `ON` on average over `MEMORY_S`, it predicts the fixes better by a
+    factor of e in sd: the two sensors do not see the same motion. A poor but honest accelerometer costs far less.
+    """
+
+    ON, OFF = 2.0, 0.5
+    MEMORY_S = 20.0
+    LEAST = 15
+    STEP_S = 0.9
+    CLIP = 25.0
+
+    def __init__(self, points: int) -> None:
+        self.bank = Bank(points, (1e-3, 1.0), (1e-4, 1e-2, 1.0, 1e2, 1e4))
+        m = len(self.bank.log_rho)
+        self.score: F64 = np.zeros((m, points, 3))  # mean surprise of each member
+        self.fused: F64 = np.zeros((points, 3))  # and of the fused filter
+        self.count = [0] * points
+        self.since = [0.0] * points
+        self.alarm = [False] * points
+
+    def forget(self, p: int) -> None:
+        self.bank.forget(p)
+        self.score[:, p] = 0.0
+        self.fused[p] = 0.0
+        self.count[p] = 0
+        self.since[p] = 0.0
+        self.alarm[p] = False
+
+    def fix(self, p: int, dt: float, z: F64, R: F64, nu: F64, S: F64, limit: float) -> bool:
+        """Take a fix z (3,) with noise R, and the fused filter's residual and variance; True = the alarm changed."""
+        self.since[p] += dt
+        if self.bank.fresh[p]:
+            self.bank.reset(p, z, np.zeros(3), np.zeros(3))
+            self.since[p] = 0.0
+            return False
+        if self.since[p] < self.STEP_S:
+            return False
+        elapsed = self.since[p]
+        self.since[p] = 0.0
+        bank = self.bank
+        zero = np.zeros((1, 3))
+        bank.predict([p], np.array([elapsed]), zero, zero)
+        s = (bank.C[0, :, p] + 1.0)[:, None] * R
+        e = z - bank.x[0, :, p]
+        e = e * e / s
+        self.count[p] += 1
+        w = max(min(elapsed / self.MEMORY_S, 0.5), 1.0 / self.count[p])
+        logs = np.array([math.log(v) for v in s.reshape(-1).tolist()]).reshape(s.shape)
+        self.score[:, p] += w * (logs + np.minimum(e, self.CLIP) - self.score[:, p])
+        logs = np.array([math.log(v) for v in S.tolist()])
+        self.fused[p] += w * (logs + np.minimum(nu * nu / S, self.CLIP) - self.fused[p])
+        total = e.sum(axis=1).tolist()
+        if min(total) <= limit:  # else an outlier for every member
+            bank.update([p], z[None], np.ones(1))
+            bank.product[:, p] = 1.0  # its own likelihood is not asked for
+        ahead = max((self.fused[p] - self.score[:, p].min(axis=0)).tolist())
+        before = self.alarm[p]
+        if self.count[p] >= self.LEAST:
+            self.alarm[p] = ahead > (self.OFF if before else self.ON)
+        return self.alarm[p] != before
+
+    def save(self) -> State:
+        return {
+            "bank": self.bank.save(), "score": self.score, "fused": self.fused, "count": list(self.count),
+            "since": list(self.since), "alarm": list(self.alarm),
+        }  # fmt: skip
+
+    def load(self, s: State) -> None:
+        self.bank.load(s["bank"])
+        self.score, self.fused = s["score"].copy(), s["fused"].copy()
+        self.count, self.since, self.alarm = list(s["count"]), list(s["since"]), list(s["alarm"])
 
 
 def third_difference_std(w: F64) -> list[float]:

@@ -7,7 +7,8 @@ its measurement time however late it comes, without rewinding anything:
 
 A fix waits for accelerations up to its time, at most `wait_s` of raw time; then the gap rule bridges what is missing
 (mean of the last 10 s, extra noise q_gap = 2 var(a) tau with tau the reciprocal mean frequency). One receiver on one
-wire delivers in order, so a fix not newer than the anchor is OLD: reported, dropped.
+wire delivers in order, so a fix not newer than the anchor, or older than the accelerations kept, is OLD: reported,
+dropped.
 
 Kinds of points. *Both sensors*: as above. *No accelerometer* (or one that is silent for `accel_lost_s`): the same
 filter with zero integrals, where -b is the acceleration and its walk the model; one estimate per fix, mode GNSS_ONLY.
@@ -33,7 +34,7 @@ from edge_agent.fusion.feed import Feed
 from edge_agent.fusion.gate import Action, Gate, Three, quantile
 from edge_agent.fusion.integrals import CHUNK, NS, SYNTHETIC, block
 from edge_agent.fusion.model import B, D, N, O, V, gap_noise, process_noise, transition
-from edge_agent.fusion.noise import CHI1_MEDIAN, Bank, robust_mask, third_difference_std
+from edge_agent.fusion.noise import CHI1_MEDIAN, Bank, Monitor, robust_mask, third_difference_std
 from edge_agent.fusion.point import Point, Wait
 from edge_agent.messages import (
     F64,
@@ -70,6 +71,10 @@ START_QUALITY = (Quality.FIXED, Quality.MANUAL, Quality.SIMULATED)
 REBASE_NS = 30 * S
 """Integrals start anew at a fix at least so often: they stay below a few hundred metres."""
 PSEUDO_NS = S
+BLOW = 8.0
+"""Bending of the accelerations beyond so many times the usual, of the interval and 0.1 s more, is a blow."""
+BEND_S = 60.0
+"""Over which the usual bending is averaged."""
 START_FIXES = 2000
 """Fixes of a start window at most: 15 s at more than 100 Hz."""
 PENDING = 256
@@ -97,10 +102,13 @@ class Station:
         n = len(self.points)
         self.feed = Feed(self.points, settings)
         self.ring = self.feed.ring
-        self.bank = Bank(n, settings)
+        self.bank = Bank(n)
+        self.monitor = Monitor(n)
         self.x: F64 = np.zeros((N, n, 3))
         self.C: F64 = np.zeros((N, N, n, 3))
         self.g: F64 = np.zeros((n, 6))  # integrals (g2, g1) at the anchor
+        self.bent: F64 = np.zeros((n, 3))  # the ring's sum at the anchor
+        self.bend_rate: F64 = np.zeros((n, 3))  # its usual rate [m2/s3]
         self.q: F64 = np.full((n, 3), settings.accel_noise_m2ps3)
         self.qb: F64 = np.full((n, 3), settings.bias_walk_m2ps5)
         self.scale: F64 = np.ones((n, 3))  # on the declared R
@@ -223,7 +231,8 @@ class Station:
         live: list[int] = []
         for p in group:
             pt = self.points[p]
-            if (pt.started or pt.window) and fix.t_ns <= pt.anchor_ns:
+            late = pt.aided and fix.t_ns <= self.ring.last_ns[p] and not self.ring.covers(p, fix.t_ns)
+            if late or ((pt.started or pt.window) and fix.t_ns <= pt.anchor_ns):
                 self.old += 1
                 out.append(self._verdict(p, fix, Verdict.OLD))
             elif not pt.started:
@@ -233,19 +242,27 @@ class Station:
         if live:
             self._step(live, fix, out)
 
-    def _increment(self, p: int, t_ns: int, dt: float) -> tuple[F64, F64]:
-        """Integrals (s1, s2) from the anchor to t; the anchor's integrals move to t. The anchor itself does not."""
-        _, _, g = self.ring.at(p, t_ns)
+    def _increment(self, p: int, t_ns: int, dt: float) -> tuple[F64, F64, F64]:
+        """Integrals (s1, s2) and the sum of `bend` from the anchor to t; the anchor's move to t, its time does not."""
+        i, _, g = self.ring.at(p, t_ns)
         old = self.g[p]
         s = g - old
         s2 = s[:3] - old[3:] * dt
         self.g[p] = g
-        return s[3:], s2
+        bent = self.ring.bent[p, i] - self.bent[p]
+        self.bent[p] = self.ring.bent[p, i]
+        return s[3:], s2, bent
+
+    def _place(self, p: int, t_ns: int) -> None:
+        """The anchor's integrals, without an increment."""
+        i, _, self.g[p] = self.ring.at(p, t_ns)
+        self.bent[p] = self.ring.bent[p, i]
 
     def _rebase(self, p: int, t_ns: int) -> None:
         if t_ns - self.ring.origin_ns[p] >= REBASE_NS:
             self.ring.rebase(p, t_ns)
             self.g[p] = 0.0
+            self.bent[p] = 0.0
 
     # ---------------------------------------------------------------------------------------------------------- start
 
@@ -272,11 +289,12 @@ class Station:
             pt.gaps = []
             pt.window_aided = aided
             if aided:
-                _, _, self.g[p] = self.ring.at(p, fix.t_ns)
+                self._place(p, fix.t_ns)
             s1 = s2 = zero
         else:
             dt = (fix.t_ns - pt.anchor_ns) * NS
-            s1, s2 = self._increment(p, fix.t_ns, dt) if aided else (zero, zero)
+            s1, s2, bent = self._increment(p, fix.t_ns, dt) if aided else (zero, zero, zero)
+            self.bend_rate[p] += (bent / dt - self.bend_rate[p]) * (1.0 / len(pt.window))
         pt.anchor_ns = fix.t_ns
         if aided:
             self._rebase(p, fix.t_ns)
@@ -375,13 +393,16 @@ class Station:
             pt.anchor_ns = fix.t_ns
             return
         _, a = self.ring.recent(p, fix.t_ns, self.settings.accel_settle_s)
+        if len(a) < 8:  # silent again before it began
+            pt.anchor_ns = fix.t_ns
+            return
         self.x[:, p] = 0.0
         self.x[B, p] = a.sum(axis=0) * (1.0 / len(a))
         self.C[:, :, p] = 0.0
         self.C[D, D, p] = self.settings.accel_only_std_m**2
         self.C[V, V, p] = 0.05**2
         self.C[B, B, p] = 0.05**2
-        _, _, self.g[p] = self.ring.at(p, fix.t_ns)
+        self._place(p, fix.t_ns)
         pt.started = pt.aided = True
         pt.anchor_ns = pt.used_ns = pt.begun_ns = fix.t_ns
         pt.gaps = []
@@ -397,6 +418,7 @@ class Station:
         seconds: list[float] = []
         s1 = np.zeros((n, 3))
         s2 = np.zeros((n, 3))
+        bent = np.zeros((n, 3))
         calm = fix.quality in SOLID
         for i, p in enumerate(points):
             pt = self.points[p]
@@ -404,12 +426,13 @@ class Station:
                 self._model(p, t, out)
             seconds.append((t - pt.anchor_ns) * NS)
             if pt.aided:
-                s1[i], s2[i] = self._increment(p, t, seconds[i])
+                s1[i], s2[i], bent[i] = self._increment(p, t, seconds[i])
             calm = calm and pt.gate.calm and not pt.floating and t - pt.used_ns <= 5 * S
         k = block(points)
         same = seconds[:1] if seconds.count(seconds[0]) == n else seconds
         Qa, Qb = process_noise(same)
         x, C = kalman.predict(self.x[:, k], self.C[:, :, k], transition(same), Qa, Qb, s1, s2, self.q[k], self.qb[k])
+        self._blows(points, k, C, bent, np.array(seconds)[:, None])
         for i, p in enumerate(points):
             if self.points[p].gaps and self.points[p].aided:
                 self._gap_variance(self.points[p], t, C[:, :, i])
@@ -420,6 +443,14 @@ class Station:
         pseudo = self.points[points[0]].receiver is None
         nu, CH, S_ = kalman.innovation(x, C, z, R)
         ratio = self._ratio(nu, S_)
+        if pseudo and max(ratio) > 1.0:
+            # Far from zero, where no structure vibrates: the bias has moved. The state follows, and its sd says so.
+            away = nu * nu * (nu * nu > 9.0 * S_)
+            C[D, D] += away
+            C[V, V] += away
+            C[B, B] += 4.0 * away
+            nu, CH, S_ = kalman.innovation(x, C, z, R)
+            ratio = self._ratio(nu, S_)
         use: F64 | float = 1.0
         used = [True] * n
         verdicts = [Verdict.ACCEPTED] * n
@@ -448,6 +479,10 @@ class Station:
             if pt.aided:
                 self._rebase(p, t)
         if not pseudo:
+            if fix.quality in SOLID:
+                for i, p in enumerate(points):
+                    if self.points[p].aided:
+                        self._contradiction(p, fix, seconds[i], z, R[i], nu[i], S_[i], out)
             self._learn_noise(points, k, z, R0, nu, S_, seconds, s1, s2, learn)
         for p in points:
             pt = self.points[p]
@@ -460,6 +495,24 @@ class Station:
         e = nu * nu
         e /= S_
         return [(a + b + c) / self.limit for a, b, c in e.tolist()]
+
+    def _blows(self, points: list[int], k: slice | list[int], C: F64, bent: F64, dt: F64) -> None:
+        """Velocity that the sampling may have missed: where the accelerations bend far more than usual (a blow, an
+        impact), a hold across an interval is wrong by 1/12 of what `integrals.bend` sums. White over the interval."""
+        usual = self.bend_rate[k]
+        extra = bent - BLOW * usual * (dt + 0.1)
+        if float(extra.max()) > 0.0:
+            e = np.maximum(extra, 0.0) * (1 / 144)
+            strong: F64 = (e - 10.0 * self.q[k] * dt).max(axis=1)
+            for i, v in enumerate(strong.tolist()):
+                if v > 0.0:
+                    self.bank.fresh[points[i]] = True  # no evidence on q
+            C[V, V] += e
+            c = e * dt * 0.5
+            C[D, V] += c
+            C[V, D] += c
+            C[D, D] += c * dt * (2 / 3)
+        self.bend_rate[k] = usual + (np.minimum(bent / dt, 4.0 * usual + 1e-15) - usual) * np.minimum(dt / BEND_S, 0.5)
 
     def _gap_variance(self, pt: Point, t_ns: int, C: F64) -> None:
         for g in pt.gaps:
@@ -505,9 +558,8 @@ class Station:
             pt.aided = True
             pt.gaps = [g for g in pt.gaps if g.end_ns > t_ns]
             # This fix still ends an interval without accelerations: its increment must come out as zero.
-            _, _, g = self.ring.at(p, t_ns)
-            g[:3] -= g[3:] * ((t_ns - pt.anchor_ns) * NS)
-            self.g[p] = g
+            self._place(p, t_ns)
+            self.g[p, :3] -= self.g[p, 3:] * ((t_ns - pt.anchor_ns) * NS)
             out.append(Event(t_ns, "ACCEL_ON", pt.name, "accelerations are there: fusion goes on with them"))
 
     def _change_model(self, p: int, b: F64, var: F64, q: F64 | float, qb: float) -> None:
@@ -519,6 +571,7 @@ class Station:
         self.q[p] = q
         self.qb[p] = qb
         self.bank.forget(p)
+        self.monitor.forget(p)
         pt.begun_ns = pt.posterior_ns = pt.anchor_ns
         pt.fixes = 0
 
@@ -581,6 +634,11 @@ class Station:
             C[V, V] = 1.0
             C[B, B] = bias
             x[V] = 0.0
+            # So tight a model was wrong: wide again, and nothing of what it seemed to know.
+            self.q[p] = np.minimum(self.q[p] * 30.0, 0.1)
+            self.qb[p] = np.minimum(self.qb[p] * 30.0, 0.1)
+            self.bank.forget(p)
+            pt.fixes = 0
             text = "refused fixes agree on nothing: the filter begins anew at this one"
             out.append(Event(t, "REACQUIRE", pt.name, text, values, pt.used_ns, t))
             return Verdict.ACCEPTED, False
@@ -708,6 +766,15 @@ class Station:
                     pt.posterior_ns = pt.anchor_ns
                     self._noise(p, R0 * self.scale[p], 1e9 if young else 0.1 * since / S)
 
+    def _contradiction(self, p: int, fix: Measurement, dt: float, z: F64, R: F64, nu: F64, S_: F64, out: Out) -> None:
+        pt = self.points[p]
+        if self.monitor.fix(p, dt, z, R, nu, S_, 2.0 * self.limit):
+            if self.monitor.alarm[p]:
+                text = "without the accelerometer the fixes are predicted better: the two do not see the same motion"
+                out.append(Event(fix.t_ns, "CONTRADICTION", pt.name, text))
+            else:
+                out.append(Event(fix.t_ns, "CONTRADICTION_END", pt.name, "accelerations and fixes agree again"))
+
     def _bank_done(self, p: int) -> None:
         self.points[p].since_bank = 0.0
         self.bank_s1[p] = 0.0
@@ -781,7 +848,7 @@ class Station:
         for i, p in enumerate(alive):
             pt = self.points[p]
             c = length[i]
-            mode, flags = self._modes(pt, t[i, :c], sd[i, :c], worst[i])
+            mode, flags = self._modes(pt, t[i, :c], sd[i, :c], worst[i], self.monitor.alarm[p])
             piece = (t[i, :c].copy(), y[i, :c], sd[i, :c], mode, flags)
             if synthetic:
                 real = kind[i, :c] != SYNTHETIC
@@ -790,7 +857,7 @@ class Station:
                 self._mode_events(pt, piece[0], piece[3], out)
                 pieces.setdefault(p, []).append(piece)
 
-    def _modes(self, pt: Point, t: I64, sd: F64, worst: list[float]) -> tuple[U8, U8]:
+    def _modes(self, pt: Point, t: I64, sd: F64, worst: list[float], contradicts: bool) -> tuple[U8, U8]:
         """Mode and flags of rows t with sd (n, 6); `worst` = the largest sd of displacement per axis."""
         s = self.settings
         base = Mode.ACCEL_ONLY if pt.receiver is None else Mode.FUSED
@@ -809,6 +876,9 @@ class Station:
             coast = t - pt.used_ns > int(s.coast_s * S)
             mode[coast] = Mode.COAST
             flags[coast & (sd[:, :3] > s.degraded_std_m).any(axis=1)] |= np.uint8(FusionFlag.DEGRADED)
+        if contradicts:
+            mode[:] = Mode.CONTRADICTION
+        if int(t[-1]) - pt.used_ns > int(s.invalid_outage_s * S):
             mode[t - pt.used_ns > int(s.invalid_outage_s * S)] = Mode.INVALID
         if max(worst[:2]) > s.invalid_std_horizontal_m or worst[2] > s.invalid_std_vertical_m:
             bad = (sd[:, :2] > s.invalid_std_horizontal_m).any(axis=1) | (sd[:, 2] > s.invalid_std_vertical_m)
@@ -844,7 +914,7 @@ class Station:
         x, C = self.x[:, p], self.C[:, :, p]
         sd = np.sqrt(np.concatenate([C[D, D], C[V, V]]))[None]
         t = np.array([t_ns])
-        mode, flags = self._modes(pt, t, sd, sd[0, :3].tolist())
+        mode, flags = self._modes(pt, t, sd, sd[0, :3].tolist(), False)
         if mode[0] == Mode.FUSED:
             mode[0] = Mode.GNSS_ONLY
         if pt.aided:
@@ -885,7 +955,8 @@ class Station:
             "points": {p.name: p.save() for p in self.points},
             "ring": self.ring.save(),
             "bank": self.bank.save(),
-            "arrays": [self.x, self.C, self.g, self.q, self.qb, self.scale, self.bank_s1, self.bank_s2],
+            "monitor": self.monitor.save(),
+            "arrays": [getattr(self, k) for k in _ARRAYS],
             "known": list(self.known),
             "unset": sorted(self.unset),
             "datums": dict(self.datums),
@@ -897,15 +968,16 @@ class Station:
             p.load(s["points"][p.name])
         self.ring.load(s["ring"])
         self.bank.load(s["bank"])
-        self.x, self.C, self.g, self.q, self.qb, self.scale, self.bank_s1, self.bank_s2 = (
-            a.copy() for a in s["arrays"]
-        )
+        self.monitor.load(s["monitor"])
+        for k, a in zip(_ARRAYS, s["arrays"], strict=True):
+            setattr(self, k, a.copy())
         self.known = list(s["known"])
         self.unset = set(s["unset"])
         self.datums = dict(s["datums"])
         self.old, self.prechecked = s["counts"]
 
 
+_ARRAYS = ("x", "C", "g", "bent", "bend_rate", "q", "qb", "scale", "bank_s1", "bank_s2")
 _BO = np.array([B, O])
 
 

@@ -3,8 +3,9 @@
 A `Rotate` closes the open segment and opens the next, whose first record is the Rotate's checkpoint; nothing else
 opens or closes one. Names are `<site>_<YYYYMMDDTHHMMSSZ>_<NNN>.mcap`, with `.part` behind while the file is open; NNN
 counts files of one second, so no two files ever share a name. Each file's metadata names the file before it and that
-file's SHA-256. Retention looks only at names of this form and this site: older than `keep_days`, more than `keep_gb`
-together, less than `free_gb` free; it never touches the open file.
+file's SHA-256. Retention looks only at names of this form and this site: older than `keep_days` (by a disciplined clock
+only: one wrong step must not empty the disk), more than `keep_gb` together, less than `free_gb` free where deleting can
+reach that; it never touches the open file.
 
 One thread drives a Recorder; time is an argument (monotonic ns). When the disk fails, the open file is sealed as far as
 it goes and RecordingError is raised; the Recorder then has no open file until the next Rotate.
@@ -101,6 +102,7 @@ class Recorder:
         self._faults: list[Fault] = []
         self._now_ns = 0
         self._utc = PLAUSIBLE
+        self._sync = False
         self._flushed_ns = self._synced_ns = self._pruned_ns = 0
 
     @property
@@ -177,6 +179,7 @@ class Recorder:
             unfinished = e
         lost = unfinished.unwritten if unfinished else ()
         self._utc = datetime.fromtimestamp(rotate.utc_ns // S, UTC)
+        self._sync = rotate.sync
         try:
             self.data_dir.mkdir(parents=True, exist_ok=True)
             self._retain()
@@ -240,7 +243,7 @@ class Recorder:
         self._pruned_ns = self._now_ns
         segments = list_segments(self.data_dir, self.site)
         keep = timedelta(days=self.settings.keep_days)
-        if self._utc >= PLAUSIBLE:
+        if self._utc >= PLAUSIBLE and self._sync:
             for segment in list(segments):
                 if PLAUSIBLE <= segment.begin < self._utc - keep:
                     self._delete(segment, f"older than {self.settings.keep_days:g} days")
@@ -248,18 +251,22 @@ class Recorder:
         total = sum(segment.size for segment in segments) + self.open_bytes
         while segments and total > self.settings.keep_gb * GB:
             segment = segments.pop(0)
-            self._delete(segment, f"more than {self.settings.keep_gb:g} GB of recordings")
-            total -= segment.size
+            if self._delete(segment, f"more than {self.settings.keep_gb:g} GB of recordings"):
+                total -= segment.size
+        missing = self.settings.free_gb * GB - self.free_bytes()
+        if missing > sum(segment.size for segment in segments):
+            return  # something else fills the disk: deleting every recording would not reach the limit either
         while segments and self.free_bytes() < self.settings.free_gb * GB:
             self._delete(segments.pop(0), f"less than {self.settings.free_gb:g} GB free")
 
-    def _delete(self, segment: Segment, why: str) -> None:
+    def _delete(self, segment: Segment, why: str) -> bool:
         try:
             segment.path.unlink()
         except OSError as e:
             self._tell("RETENTION_FAILED", f"{segment.path.name} cannot be deleted: {e.strerror or e}", segment)
-        else:
-            self._tell("RETENTION", f"{segment.path.name} deleted: {why}", segment)
+            return False
+        self._tell("RETENTION", f"{segment.path.name} deleted: {why}", segment)
+        return True
 
     def _tell(self, kind: str, text: str, segment: Segment) -> None:
         self._faults.append(Fault(self._now_ns, "recorder", kind, text, (("bytes", float(segment.size)),)))

@@ -88,9 +88,9 @@ def test_bytes_do_not_depend_on_the_processors_features() -> None:
         other, exp = _run(" ".join(features[:k]))
         assert other == fused
         controls.add(exp)
-    if controls == {control}:
-        pytest.skip(f"np.exp is the same with and without {features}: the comparison says nothing on this processor")
-    assert controls != {control}
+    if not {"X86_V4", "AVX512_SKX", "AVX512F", "X86_V3", "AVX2"} & set(features):
+        pytest.skip(f"np.exp has no loop of its own for {features}: the comparison says nothing on this processor")
+    assert controls != {control}, "np.exp did not change: the setting did nothing, so equal fused bytes prove nothing"
 
 
 def _names(tree: ast.AST) -> set[str]:

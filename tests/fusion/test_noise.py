@@ -9,7 +9,7 @@ import pytest
 from oracles import process_noise, transition
 
 from edge_agent.fusion.noise import Bank, fix_std, robust_mask, third_difference_std
-from edge_agent.messages import FusionSettings, Quality
+from edge_agent.messages import Quality
 
 NAN = math.nan
 NO = (NAN, NAN, NAN)
@@ -76,7 +76,7 @@ def test_bank_gives_each_members_exact_likelihood() -> None:
     rng = np.random.default_rng(3)
     dt = rng.uniform(0.05, 0.4, 25)
     z = np.cumsum(rng.standard_normal((26, 3)) * 0.01, axis=0)
-    bank = Bank(2, FusionSettings())
+    bank = Bank(2)
     bank.reset(1, z[0], np.zeros(3), np.zeros(3))
     one = np.ones(1)
     for k in range(25):
@@ -120,7 +120,7 @@ def test_bank_finds_the_noise_that_made_the_data() -> None:
         for k in range(n):
             x = F @ x + chol @ rng.standard_normal(3)
             z[k, axis] = x[0] + math.sqrt(r) * rng.standard_normal()
-    bank = Bank(1, FusionSettings())
+    bank = Bank(1)
     bank.reset(0, z[0], np.zeros(3), np.zeros(3))
     step, one, zero = np.array([0.1]), np.ones(1), np.zeros((1, 3))
     for k in range(1, n):

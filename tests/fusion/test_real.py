@@ -10,6 +10,8 @@ from fusion_play import F64, T0, Played, S, accel_items, blocks_of, fix_items, p
 from oracles import dense_smoother, first_order_hold, process_noise, transition
 from scipy.optimize import minimize
 
+from edge_agent.messages import VALID_MODES, Verdict
+
 ZEROS = (0.0, 0.0)
 
 
@@ -124,3 +126,22 @@ def test_shaker_between_clean_fixes(shared_data: Path) -> None:
 
 def test_shaker_with_a_millimetre_of_noise(shared_data: Path) -> None:
     assert shaker(shared_data, 0.001) < 0.0009
+
+
+def test_tohoku_as_labelled_is_two_sensors_that_contradict_each_other(shared_data: Path) -> None:
+    """The accelerometer's labels are 43 s early: the shaking comes before the fixes move, and again without cause."""
+    folder = shared_data / "B1-tohoku2011-gps0041-fks011"
+    gps, acc = np.loadtxt(folder / "gps.dat"), np.loadtxt(folder / "acc.dat")
+    begin = gps[0, 0]
+    t_z, z = gps[:, 0] - begin, gps[:, 1]
+    p = east(acc[:, 0] - begin, acc[:, 1], t_z, z, 0.0174)
+    t = (p.t - T0) / S
+    alarm = [(e.t_ns - T0) / S for e in p.events if e.kind == "CONTRADICTION"]
+    assert alarm
+    assert 30 < alarm[0] < 75  # the accelerations grow from 17 s on, the fixes move from 60 s on
+    used = [i.t_ns for i in p.innovations if i.verdict in (Verdict.ACCEPTED, Verdict.OFFSET)]
+    assert np.diff(used).max() < 60 * S
+    error = np.abs(p.d[:, 0] - np.interp(t, t_z, z))
+    valid = np.isin(p.column("mode"), VALID_MODES)
+    print(f"as labelled: alarm at {alarm[0]:.0f} s; largest error while valid {error[valid].max():.3f} m")
+    assert error[valid].max() < 1.0
