@@ -612,7 +612,7 @@ class Agent:
             self._tell_losses()
         if self.pipeline.wall.sync != self._synced:
             self._synced = self.pipeline.wall.sync
-            words = "is disciplined" if self._synced else "is NOT disciplined: fix times rest on the assumed latency"
+            words = "is disciplined" if self._synced else "is NOT disciplined: fixes rest on a latency set or assumed"
             self.say(INFO if self._synced else WARNING, f"clock: the host's clock {words}")
         counters = self.pipeline.counters()
         for port, watch in self._watch.items():
