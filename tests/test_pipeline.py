@@ -11,7 +11,7 @@ import pytest
 
 from edge_agent import assemble, config
 from edge_agent.geodesy import Frame
-from edge_agent.messages import CanFrames, Config, Raw, Record, S, Tick
+from edge_agent.messages import CanFrames, Config, FusionFlag, Raw, Record, S, Tick
 from edge_agent.pipeline import Pipeline
 from edge_agent.recording import topics
 from edge_agent.simulate import SCENARIOS, simulate
@@ -198,3 +198,21 @@ def test_frames_of_nobody_are_recorded_and_cause_nothing(hostile: tuple[Config, 
     )
     records = assemble.pipeline(settings).step(Raw(S, 0, port, frames))
     assert [r.topic for r in records] == [f"/raw/{port}"]
+
+
+@pytest.mark.parametrize("latency_ms", [None, 200.0])
+def test_fix_times_that_rest_on_an_assumption_are_flagged(
+    hostile: tuple[Config, list[Raw]], latency_ms: float | None
+) -> None:
+    """GIVEN a host clock that nothing disciplines WHEN the latency is not configured THEN the stream says so."""
+    settings, raws = hostile
+    receivers = {k: replace(r, latency_ms=latency_ms) for k, r in settings.receivers.items()}
+    pipeline = assemble.pipeline(replace(settings, receivers=receivers))
+    flags = set()
+    for raw in raws[: len(raws) // 2]:
+        if isinstance(raw.payload, Tick):
+            raw = replace(raw, payload=replace(raw.payload, sync=False))
+        for r in pipeline.step(raw):
+            if r.topic.endswith("/block"):
+                flags |= {int(f) & FusionFlag.TIME_UNCERTAIN for f in topics.decode_fused_block("p", r.data).flags}
+    assert flags == ({FusionFlag.TIME_UNCERTAIN} if latency_ms is None else {0})

@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 
 from edge_agent import assemble, config
-from edge_agent.messages import Config, Raw, Record, RecordSettings, Rotate, S
+from edge_agent.messages import Config, Raw, Record, RecordSettings, Rotate, S, Tick
 from edge_agent.recording import topics
-from edge_agent.recording.reader import read_messages
+from edge_agent.recording.reader import read_messages, read_metadata
 from edge_agent.recording.repair import recover
 from edge_agent.recording.segments import Recorder
-from edge_agent.replay import ReplayError, replay
+from edge_agent.recording.writer import RUN_METADATA
+from edge_agent.replay import ReplayError, in_order, replay
 from edge_agent.simulate import SCENARIOS, simulate
 from edge_agent.simulate.encode import config_yaml, dbc_text, raw_blocks
 
@@ -37,20 +38,21 @@ def record(
     drop: Callable[[Record], bool] = lambda record: False,
     finish: bool = True,
     raws: list[Raw] | None = None,
+    run: str = "",
 ) -> list[Path]:
     """What a run writes, without threads: rotation every 15 s, `drop` = records that never reach the file."""
     settings, all_raws = setup
     attachments = {"config.yaml": settings.text.encode(), **dict(settings.files)}
-    metadata = {"platform": assemble.platform_name()}
+    metadata = {"platform": assemble.platform_name()} | ({"run": run} if run else {})
     recorder = Recorder(folder, RecordSettings(free_gb=0.0), "test", metadata, attachments, lambda: 1 << 40)
     pipeline = assemble.pipeline(settings)
     period = None
     for i, raw in enumerate(raws or all_raws):
         raw = replace(raw, order=pipeline.order)
         now = i * 10_000_000
-        if pipeline.to_utc(raw.t_ns) // (ROTATE_S * S) != period and i > 0:
-            period = pipeline.to_utc(raw.t_ns) // (ROTATE_S * S)
+        if i > 0 and (pipeline.rotate_due or pipeline.to_utc(raw.t_ns) // (ROTATE_S * S) != period):
             recorder.handle(pipeline.rotate("time", raw.t_ns), now)
+            period = pipeline.to_utc(raw.t_ns) // (ROTATE_S * S)
         for r in pipeline.step(raw):
             if recorder.path is not None and not drop(r):
                 recorder.handle(r, now)
@@ -198,6 +200,23 @@ def test_the_output_replays_to_itself_and_retune_changes_it(setup: tuple[Config,
     assert same
     assert changed
     assert same != changed
+
+
+def test_files_of_a_run_go_by_their_number_not_by_a_clock_that_was_set_back(
+    setup: tuple[Config, list[Raw]], tmp_path: Path
+) -> None:
+    settings, raws = setup
+    back = [
+        replace(r, payload=replace(r.payload, utc_ns=r.payload.utc_ns - 7200 * S))
+        if isinstance(r.payload, Tick) and r.t_ns > raws[0].t_ns + 25 * S
+        else r
+        for r in raws
+    ]
+    files = record(tmp_path, setup, raws=back, run="one")
+    numbers = [int(read_metadata(f)[RUN_METADATA]["segment"]) for f in files]
+    assert numbers != sorted(numbers)  # the names do step back
+    assert in_order(files) == [f for _, f in sorted(zip(numbers, files, strict=True))]
+    assert replay(files, None, settings, True).ok
 
 
 def test_nothing_to_replay_is_said(tmp_path: Path) -> None:

@@ -495,3 +495,12 @@ def test_a_wrong_driver_ends_the_agent_and_is_recorded(script: list[Raw], tmp_pa
     files = recordings(tmp_path / "rec")
     assert [(f["source"], f["text"]) for f in faults(files, "CRASH")] == [(CAN, "ZeroDivisionError: a bug")]
     assert [r.order for r in raws(files)] == list(range(50))
+
+
+def test_a_card_that_does_not_answer_is_no_crash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def broken(path: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    assert runtime.free_bytes(tmp_path / "not" / "there") > 0
+    monkeypatch.setattr(runtime.shutil, "disk_usage", broken)
+    assert runtime.free_bytes(tmp_path) == -1

@@ -440,6 +440,18 @@ def test_incomplete_samples_count_as_missing() -> None:
     assert np.abs(p.d - truth[np.searchsorted(t, p.t)]).max() < 0.012
 
 
+def test_saturated_samples_count_as_missing() -> None:
+    """GIVEN samples at full scale WHEN they are flagged THEN they are left out."""
+    t, a, truth, tf, z, _ = bridge(40.0)
+    a = a.copy()
+    a[2500::200, 0] = 160.0
+    items = accel_items(t, a, blocks_of(t))
+    flagged = [(n, k, replace(b, flags=np.where(b.xyz[:, 0] > 100, 1, 0).astype(np.uint8))) for n, k, b in items]
+    p = play(flagged + fix_items(tf, z))
+    assert not set(t[2500::200]) & set(p.t.tolist())
+    assert np.abs(p.d - truth[np.searchsorted(t, p.t)]).max() < 0.012
+
+
 def test_nothing_locks_out_when_fixes_agree_on_nothing() -> None:
     t, a, _, tf, z, _ = bridge(90.0)
     z = z.copy()

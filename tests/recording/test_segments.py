@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -250,6 +251,27 @@ def test_the_open_file_counts_but_is_never_deleted(tmp_path: Path) -> None:
     path = recorder.close()
     assert path is not None
     assert texts(path) == ["x 1"]
+
+
+def test_an_undisciplined_clock_deletes_nothing_for_its_age(tmp_path: Path) -> None:
+    """GIVEN a wall clock a year ahead that nothing disciplines WHEN segments begin THEN all recordings stay."""
+    made = fill(tmp_path, [3, 2, 1], 100)
+    recorder = start(tmp_path, keep_days=30.0)
+    for year in (1, 2):
+        recorder.handle(replace(rotate(T + year * 366 * 86400 * S), sync=False))
+    assert set(made) < set(names(tmp_path))
+    assert recorder.drain_faults() == []
+    recorder.handle(rotate(T + 3 * 366 * 86400 * S))
+    assert len([f for f in recorder.drain_faults() if f.kind == "RETENTION"]) >= 3
+    recorder.close()
+
+
+def test_a_disk_that_others_fill_costs_no_recordings_in_vain(tmp_path: Path) -> None:
+    made = fill(tmp_path, [3, 2, 1], 1000)
+    recorder = start(tmp_path, lambda: 5_000_000, free_gb=1.0)
+    recorder.handle(rotate())
+    assert set(made) < set(names(tmp_path))
+    recorder.close()
 
 
 def test_free_space_is_kept_while_a_file_is_open(tmp_path: Path) -> None:
