@@ -105,7 +105,9 @@ def test_through_an_slcan_adapter(folder: Path, tmp_path: Path, monkeypatch: pyt
     assert ledger["dropped_inbox"] == ledger["refused_outbox"] == ledger["dropped_kernel"] == 0
     report = replay(files, None, None, True)
     assert report.ok, str(report)
-    assert report.compared == report.derived > 100
+    # How many is the machine's affair: a block is whatever one read found waiting.
+    blocks = len(stored(files, "/accel/imu/block"))
+    assert report.compared == report.derived > blocks > 1
 
 
 def test_through_import_and_replay(folder: Path, tmp_path: Path) -> None:
