@@ -29,6 +29,9 @@ CODECS: Mapping[str, str] = {
 class PortError(OSError):
     """A device could not be opened or was lost. The text says which, why, and where it helps what to do."""
 
+    def __str__(self) -> str:
+        return self.strerror or super().__str__()  # without the number, which tells a technician nothing
+
 
 def load(table: Mapping[str, str], kind: str) -> Any:
     """The class that `table` names for `kind`. Raises ValueError for a kind that is not in the table."""

@@ -1,11 +1,13 @@
 """The CAN port: drains a bus and hands on one packed block of frames per `block_ms`. Waking up costs, not reading.
 
-The bus is opened through python-can. Two sources of frames:
+The bus is opened through python-can. Three sources of frames:
 - SocketCAN: `FrameSocket` reads the socket itself, without blocking, every `drain_ms`, with the kernel's arrival stamp
   of each frame and its count of dropped ones. The stamps are wall time; `monotonic_stamps` makes them monotonic time
   and recognises a clock step under them.
-- every other interface of python-can (slcan, virtual, udp_multicast, pcan, ...): `bus.recv`, drained likewise and
-  stamped as each call returns, with the flag DRAIN.
+- slcan: `FrameSerial` reads the adapter's serial device itself, in blocks (python-can reads byte by byte), and stamps
+  what one read gave with its time, with the flag DRAIN.
+- every other interface of python-can (virtual, udp_multicast, pcan, ...): `bus.recv`, drained likewise and stamped as
+  each call returns, with the flag DRAIN.
 
 Frames are recorded as they came, error frames too: judging them is the codec's work. What is lost here is counted: by
 the kernel (`dropped`, also in each block), by the controller (`error_controller`, `overruns`). A lost link or device is
@@ -30,12 +32,15 @@ import numpy.typing as npt
 
 from drivers import PortError
 from drivers.clock_port import clock_pair
+from drivers.slcan_lines import SlcanLines
 from edge_agent.messages import I64, MS, CanFlag, CanFrames, PortSettings, S
 
 RECEIVE_BUFFER = 4 << 20
 """SO_RCVBUF in bytes. The kernel charges 0.75 kB for a small frame: 1.4 s of a full 1 Mbit/s bus, where the default
 holds 277 frames. Without CAP_NET_ADMIN the kernel cuts it to net.core.rmem_max."""
 DRAIN_NS = 50_000_000  # longest drain of a python-can bus
+SERIAL_BYTES = 1 << 16
+SERIAL_READS = 16  # in one drain: at most 64 kB, for the kernel hands out 4 kB at a time; 0.3 s of a full 1 Mbit/s bus
 DRAIN_LIMIT = 8192
 """Frames taken in one drain, so that a flood cannot hold the thread; the rest waits 20 ms in the kernel's buffer."""
 MARGIN_NS = 50 * MS
@@ -307,6 +312,51 @@ class FrameBus:
         )
 
 
+class SerialLike(Protocol):
+    """What `FrameSerial` needs of a pyserial port."""
+
+    timeout: float | None
+
+    def read(self, size: int, /) -> bytes: ...
+
+
+class FrameSerial:
+    """Frames of an slcan adapter, gathered over drains into a block; stamped when their bytes were read."""
+
+    def __init__(self, port: SerialLike, counters: dict[str, int]) -> None:
+        self.failure: OSError | None = None
+        self.counters = counters
+        self._port = port
+        port.timeout = 0.0  # a read takes what is there; one of a lost device raises
+        self._lines = SlcanLines()
+        self._reads: list[tuple[int, bytes]] = []
+
+    def drain(self) -> None:
+        """Take what is waiting. Never blocks; an error of the device is kept in `failure`."""
+        for _ in range(SERIAL_READS):
+            try:
+                data = self._port.read(SERIAL_BYTES)
+            except OSError as e:  # SerialException is one
+                self.failure = e
+                break
+            if not data:
+                break
+            self._reads.append((time.monotonic_ns(), data))
+
+    def block(self) -> CanFrames | None:
+        """The frames since the block before as one packed block, None if there were none."""
+        reads, self._reads = self._reads, []
+        before = self._lines.malformed
+        columns = self._lines.feed(b"".join([data for _, data in reads]))
+        self.counters["malformed"] += self._lines.malformed - before
+        if columns is None:
+            return None
+        can_id, flags, length, data, places = columns
+        ends = np.cumsum([len(d) for _, d in reads])
+        t_ns = np.array([t for t, _ in reads], np.int64)[np.searchsorted(ends, places, side="right")]
+        return CanFrames(t_ns, can_id, flags | np.uint8(CanFlag.DRAIN), length, data)
+
+
 # ---------------------------------------------------------------------------------------------------------------- port
 
 
@@ -322,7 +372,7 @@ class CanPort:
         names = ["blocks", "frames", "dropped", "malformed", "spread", "error_frames", "overruns", "receive_buffer"]
         self.counters: dict[str, int] = dict.fromkeys([*names, *ERROR_CLASSES.values()], 0)
         self._bus: Any = None
-        self._source: FrameSocket | FrameBus | None = None
+        self._source: FrameSocket | FrameSerial | FrameBus | None = None
         self._next_drain_ns = 0
         self._block_end_ns = 0
         self._last_ns = 0
@@ -342,6 +392,8 @@ class CanPort:
             now_ns = time.monotonic_ns()
             if s.interface == "socketcan":
                 self._source = FrameSocket(self._bus.socket, self.counters, now_ns, self._last_ns)
+            elif s.interface == "slcan":
+                self._source = FrameSerial(self._bus.serialPortOrig, self.counters)
             else:
                 self._source = FrameBus(self._bus, self.counters)
         except (can.CanError, OSError, ValueError, NotImplementedError) as e:

@@ -1,14 +1,16 @@
 """Signals of CAN frames: where their bits lie, compiled once and decoded in numpy blocks; and their names in DBC files.
 
 Every signal becomes the list of its bytes from least to most significant, a shift and a mask. Both byte orders come out
-the same that way: Motorola only lists its bytes the other way round. Multiplexed signals are refused by name.
+the same that way: Motorola only lists its bytes the other way round. Which frames hold a signal is part of it: the bits
+of the identifier that must agree (all of them, or for J1939 those of the PGN), and for a multiplexed signal the values
+that its selectors must have.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,9 @@ import numpy.typing as npt
 from edge_agent.messages import F64, U8, SignalField
 
 U64 = npt.NDArray[np.uint64]
+
+WHOLE_ID = 0x1FFFFFFF  # every bit of an identifier
+ANY_SOURCE = 0xFE  # J1939-81: the null address; DBC files write it where the source does not matter
 
 
 # ------------------------------------------------------------------------------------------------------------ signals
@@ -39,6 +44,11 @@ class SignalSpec:
     offset: float
     unit: str = ""
     modulus: int = 0  # as a counter: values before it wraps
+    mask: int = WHOLE_ID  # bits of an identifier that must be those of `can_id`
+    j1939: bool = False  # `can_id` is a J1939 identifier, as the DBC file or the field says
+    when: tuple[
+        tuple[SignalSpec, tuple[int, ...]], ...
+    ] = ()  # selectors, outermost first, and the values they must have
 
     @property
     def need(self) -> int:
@@ -46,12 +56,37 @@ class SignalSpec:
         return max(self.columns) + 1
 
 
+def j1939_mask(can_id: int) -> int:
+    """Bits of an identifier that make its PGN (SAE J1939-21): both data page bits and PDU format; from format 240 on
+    (PDU2) the next byte too, below it (PDU1) that byte is the destination. Priority and source are no part of it."""
+    return 0x03FFFF00 if can_id >> 16 & 0xFF >= 240 else 0x03FF0000
+
+
+def by_pgn(spec: SignalSpec, source: int | None) -> SignalSpec:
+    """The signal in every frame of its PGN, of any priority, to any destination, from `source` (None: from any)."""
+    mask = j1939_mask(spec.can_id)
+    can_id = spec.can_id & mask
+    if source is not None:
+        mask, can_id = mask | 0xFF, can_id | source
+    return replace(spec, can_id=can_id, mask=mask)
+
+
 def compile_signal(name: str, field: SignalField, unit: str = "", maximum: float | None = None) -> SignalSpec:
     """Compile a field. `start` counts as in a DBC file: the least significant bit for little endian, the most
     significant one for big endian, with bit 0 the lowest bit of byte 0 in both. Raises ValueError with the reason."""
-    top = 0x1FFFFFFF if field.extended else 0x7FF
-    if not 0 <= field.can_id <= top:
-        raise ValueError(f"{name}: identifier 0x{field.can_id:X} does not fit, 0x{top:X} is the largest")
+    can_id, extended = field.can_id, field.extended
+    if field.pgn is not None:
+        can_id, extended = field.pgn << 8 | ANY_SOURCE, True
+        if not 0 <= field.pgn <= 0x3FFFF:
+            raise ValueError(f"{name}: PGN {field.pgn} does not fit, 0x3FFFF is the largest")
+        if field.pgn << 8 & ~j1939_mask(can_id):
+            raise ValueError(
+                f"{name}: PGN 0x{field.pgn:X} has a format below 240, where the last byte is a destination: "
+                f"write 0x{field.pgn & 0x3FF00:X}"
+            )
+    top = 0x1FFFFFFF if extended else 0x7FF
+    if not 0 <= can_id <= top:
+        raise ValueError(f"{name}: identifier 0x{can_id:X} does not fit, 0x{top:X} is the largest")
     if not 1 <= field.length <= 64:
         raise ValueError(f"{name}: a length of {field.length} bits is not between 1 and 64")
     if field.is_float and field.length not in (16, 32, 64):
@@ -78,8 +113,8 @@ def compile_signal(name: str, field: SignalField, unit: str = "", maximum: float
         modulus -= 1
     return SignalSpec(
         name,
-        field.can_id,
-        field.extended,
+        can_id,
+        extended,
         columns,
         shift,
         field.length,
@@ -89,6 +124,7 @@ def compile_signal(name: str, field: SignalField, unit: str = "", maximum: float
         field.offset,
         unit,
         modulus,
+        j1939=field.pgn is not None,
     )
 
 
@@ -155,7 +191,8 @@ class Decoder:
 
     def __call__(self, data: U8, length: U8) -> F64:
         """Scaled values (n, k) of frames that are all at least `need` bytes long."""
-        values: F64 = self.raw(data, length) * self.scale + self.offset
+        with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one, which the codec refuses
+            values: F64 = self.raw(data, length) * self.scale + self.offset
         return values
 
 
@@ -183,9 +220,9 @@ class Dbc:
             raise ValueError(f"{path}: not a DBC file: {e}") from None
         self.messages: list[Any] = list(database.messages)
 
-    def find(self, name: str, among: set[tuple[bool, int]] | None = None) -> list[SignalSpec]:
-        """Every signal that `name` ("Signal", "Message.Signal" or "0x1A.Signal") may mean, in the messages with the
-        (extended, identifier) of `among` if given. Raises ValueError if there is none."""
+    def find(self, name: str, among: Sequence[SignalSpec] | None = None) -> list[SignalSpec]:
+        """Every signal that `name` ("Signal", "Message.Signal" or "0x1A.Signal") may mean, in the messages that
+        carry a signal of `among` if given. Raises ValueError if there is none."""
         message_name, _, signal_name = name.rpartition(".")
         messages = self.messages
         if message_name:
@@ -196,7 +233,7 @@ class Dbc:
                     f"{_listed(f'{m.name} (0x{m.frame_id:X})' for m in self.messages)}"
                 )
         if among is not None:
-            messages = [m for m in messages if (m.is_extended_frame, m.frame_id) in among]
+            messages = [m for m in messages if any(_carries(m, s) for s in among)]
         found = [(m, s) for m in messages for s in m.signals if s.name == signal_name]
         if not found:
             known = "; ".join(
@@ -217,11 +254,6 @@ class Dbc:
 
     def _compile(self, message: Any, signal: Any) -> SignalSpec:
         name = f"{message.name}.{signal.name}"
-        if signal.multiplexer_ids is not None:
-            raise ValueError(
-                f"{self.path}: signal {name} is multiplexed (it is in a frame only when "
-                f"{signal.multiplexer_signal} says so), which is not supported; take a signal that every frame carries"
-            )
         field = SignalField(
             can_id=message.frame_id,
             start=signal.start,
@@ -234,7 +266,32 @@ class Dbc:
             extended=message.is_extended_frame,
         )
         maximum = None if signal.maximum is None else float(signal.maximum)
-        return compile_signal(name, field, signal.unit or "", maximum)
+        spec = compile_signal(name, field, signal.unit or "", maximum)
+        when: list[tuple[SignalSpec, tuple[int, ...]]] = []
+        inner = signal
+        while inner.multiplexer_ids is not None:  # extended multiplexing: a selector may itself be selected
+            selector = next((s for s in message.signals if s.name == inner.multiplexer_signal), None)
+            if selector is None or len(when) == len(message.signals):
+                raise ValueError(
+                    f"{self.path}: signal {name} is multiplexed by {inner.multiplexer_signal}, which is no signal"
+                )
+            when.insert(0, (self._selector(message, selector), tuple(sorted(inner.multiplexer_ids))))
+            inner = selector
+        j1939 = bool(message.protocol == "j1939" and message.is_extended_frame)
+        return replace(spec, when=tuple(when), j1939=j1939)
+
+    def _selector(self, message: Any, signal: Any) -> SignalSpec:
+        """A selector by its bits: its scale, sign and own place in the multiplexing do not matter."""
+        order = "little" if signal.byte_order == "little_endian" else "big"
+        field = SignalField(
+            message.frame_id, signal.start, signal.length, order, False, extended=message.is_extended_frame
+        )
+        return compile_signal(f"{message.name}.{signal.name}", field)
+
+
+def _carries(message: Any, spec: SignalSpec) -> bool:
+    mask = spec.mask if spec.mask == WHOLE_ID else spec.mask & ~0xFF  # a source address is the configuration's
+    return bool(message.is_extended_frame == spec.extended and message.frame_id & mask == spec.can_id & mask)
 
 
 def _hex(text: str) -> int:

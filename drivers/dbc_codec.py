@@ -5,14 +5,20 @@ Rules:
   its reason (`rejected`); `frames` = accepted + duplicates + rejected + pending. Nothing here raises for bad input.
 - Error frames belong to the bus, not to a sensor: their identifier holds an error class. They are never candidates.
 - Equal payloads are no duplicates; only an equal counter is one.
-- x, y and z may come in one frame or in up to three. A sample with a missing axis is dropped and counted, and the next
-  one is flagged GAP_BEFORE: the filter can bridge a gap that it knows of, it cannot use half a vector. Frames are
-  matched by the counter where each of them carries one, else by their order; see `_Assembly`.
+- x, y and z may come in one frame or in up to three, of several identifiers or multiplexed in one. A sample with a
+  missing axis is dropped and counted, and the next one is flagged GAP_BEFORE: the filter can bridge a gap that it knows
+  of, it cannot use half a vector. Frames are matched by the SYNC before them, by the counter where each of them carries
+  one, else by their order; see `can_assembly`.
+- A sensor that samples at the CANopen SYNC has sampled at the SYNC: that is the sample's time.
+- J1939 messages are told by their PGN, from one source address only: where the settings name none, the first that came
+  is taken and every other refused. Two sensors are never mixed.
+- Samples that are not to be believed are flagged SPIKE and STUCK; see `accel_watch`.
 - Any cut of the frames into blocks gives the same samples, bit for bit, except for what `CanFrames.dropped` says of a
   block. Arithmetic is + and * only, written out: no BLAS, no einsum.
 - A mistake in the settings is a ValueError at construction that says what exists.
 
-Left out: multiplexed signals (refused by name), checksums, flatline and spike flags.
+Left out: checksums; producing the SYNC (a device on the bus does, or nobody); J1939 transport protocol (an acceleration
+fits into one frame).
 """
 
 from __future__ import annotations
@@ -20,10 +26,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
-from drivers.can_signals import Dbc, Decoder, SignalSpec, compile_signal
+from drivers.accel_watch import Watch
+from drivers.can_assembly import LEARN_RATIO, Assembly, Message, Presence
+from drivers.can_signals import Dbc, SignalSpec, by_pgn, compile_signal
 from edge_agent.messages import (
     F64,
     I64,
@@ -63,18 +72,14 @@ DBC_UNITS = {
 LARGEST_MPS2 = 1e4  # about 1000 g: no structure lives through it, and such a number is a damaged or misread frame
 SATURATED_PART = 0.999  # of full scale: the last step of a 10-bit converter
 ROTATION_TOLERANCE = 0.01  # rows orthonormal within: 1 % covers matrices written with three decimals
-LEARN_FRAMES = 64  # frames of a set of messages from which the first of the set is learned
-LEARN_RATIO = 1.5  # the pause between sets must be so much longer than the pauses within, else order tells nothing
 LEARN_SAMPLES = 1024  # samples from which the period is learned when the settings give no rate
 DRAIN_PATIENCE_NS = 2 * S  # stamps made at a drain may bunch; only a silence beyond this means a stopped stream
 TRUST_BITS = 8  # a counter wider than this that jumps too far was reset; a narrower one may have lost most of a turn
-LATE_RATIO = 1.5  # a set of messages that takes longer than so many periods mixes two samples
 
 KIND = int(CanFlag.EXT | CanFlag.RTR | CanFlag.ERR)
 SOFT = np.uint8(CanFlag.DRAIN | CanFlag.SPREAD)
 """Frames whose stamp is not an arrival."""
-# numpy takes an IntFlag for an int64
-GAP_BEFORE, SATURATED = np.uint8(AccelFlag.GAP_BEFORE), np.uint8(AccelFlag.SATURATED)
+GAP_BEFORE = np.uint8(AccelFlag.GAP_BEFORE)  # numpy takes an IntFlag for an int64
 
 COUNTERS = (
     "frames",
@@ -88,27 +93,9 @@ COUNTERS = (
     "incomplete",
     "resets",
     "saturated",
+    "stuck",
+    "spikes",
 )
-
-
-# ----------------------------------------------------------------------------------------------------------- assembly
-
-
-class _Message:
-    """One of the one to three messages that carry the axes, and perhaps the counter."""
-
-    def __init__(self, axes: list[tuple[int, SignalSpec]], counter: SignalSpec | None) -> None:
-        spec = axes[0][1]
-        self.can_id = spec.can_id
-        self.extended = spec.extended
-        self.kind = int(CanFlag.EXT) if spec.extended else 0
-        self.axes = [axis for axis, _ in axes]
-        self.counter = counter
-        self.decoder = Decoder([s for _, s in axes])
-        self.numbers = Decoder([counter]) if counter is not None else None
-        self.skips = counter is not None and counter.modulus != 1 << counter.length
-        self.need = max(self.decoder.need, self.numbers.need if self.numbers else 0)
-        self.name = f"0x{self.can_id:X} ({', '.join('xyz'[a] for a in self.axes)})"
 
 
 @dataclass(slots=True)
@@ -122,116 +109,6 @@ class _Rows:
     counter: I64 | None
 
 
-class _Assembly:
-    """Matches frames of several messages to samples, frame by frame, so that no cut matters.
-
-    With a counter in each message a set is the frames of one counter value. Else a set begins with the message that
-    comes first: until it is known the one with the lowest identifier (it wins the bus when a device queues its frames
-    at once), then the one before which the pause is longest, learned from the kernel's stamps. A set that lasts longer
-    than LATE_RATIO periods is broken too: frames of two samples would make a false one.
-    """
-
-    def __init__(self, messages: Sequence[_Message]) -> None:
-        self.size = len(messages)
-        self.keyed = all(m.counter is not None for m in messages)
-        self.first = min(range(self.size), key=lambda j: (messages[j].extended, messages[j].can_id))
-        self.known = self.keyed
-        self.key = -1  # counter of the open set
-        self.done = False  # that set has been handed out
-        self.number = 0  # sets so far, broken ones included
-        self.pending: list[tuple[int, int, int, int, list[float]]] = []  # message, t_ns, counter, flags, three values
-        self.open: list[int] = []  # places of the set that `run` left open
-        self.last_ns = -1
-        self.pauses = [0] * self.size
-        self.seen = [0] * self.size
-        self.period_ns = 0
-
-    def _learn(self, m: int, t: int, soft: int) -> None:
-        """Learn from LEARN_FRAMES kernel-stamped frames which message begins a set, and the period."""
-        if soft:  # these stamps say nothing about pauses
-            self.last_ns = -1
-            return
-        if self.last_ns >= 0:
-            self.pauses[m] += t - self.last_ns
-            self.seen[m] += 1
-        self.last_ns = t
-        if sum(self.seen) < LEARN_FRAMES or min(self.seen) == 0:
-            return
-        means = [p / n for p, n in zip(self.pauses, self.seen, strict=True)]
-        order = sorted(range(self.size), key=lambda j: means[j])
-        if means[order[-1]] > LEARN_RATIO * means[order[-2]]:
-            self.first = order[-1]
-        self.period_ns = sum(self.pauses) // max(self.seen)
-        self.known = True
-
-    def run(
-        self, msg: list[int], t: list[int], key: list[int], soft: list[int]
-    ) -> tuple[list[list[int]], list[int], list[list[int]], int]:
-        """Walk the pending frames and then the new ones, given as columns.
-
-        Returns (complete sets as places in the order of arrival, their numbers, broken sets, duplicates). What is still
-        open afterwards is `self.open`.
-        """
-        whole: list[list[int]] = []
-        numbers: list[int] = []
-        broken: list[list[int]] = []
-        duplicates = 0
-        late_ns = int(LATE_RATIO * self.period_ns)
-        current = list(range(len(self.pending)))
-        for k in range(len(current), len(msg)):
-            m = msg[k]
-            if not self.known:
-                self._learn(m, t[k], soft[k])
-                late_ns = int(LATE_RATIO * self.period_ns)
-            if key[k] != self.key if self.keyed else m == self.first:
-                begins = True
-                self.done = False
-                self.key = key[k]
-            elif self.keyed:
-                if self.done or any(msg[i] == m for i in current):
-                    duplicates += 1
-                    continue
-                begins = False
-            else:  # a repeated or a late frame: the frame that begins a set, and more, was lost
-                begins = any(msg[i] == m for i in current) or bool(
-                    late_ns and current and not soft[k] and t[k] - t[current[0]] > late_ns
-                )
-            if begins and current:
-                broken.append(current)
-                self.number += 1
-                current = []
-            current.append(k)
-            if len(current) == self.size:
-                whole.append(current)
-                numbers.append(self.number)
-                self.number += 1
-                current = []
-                self.done = True
-        self.open = current
-        return whole, numbers, broken, duplicates
-
-    def save(self) -> State:
-        return {
-            "first": self.first,
-            "known": self.known,
-            "key": self.key,
-            "done": self.done,
-            "number": self.number,
-            "pending": [list(p) for p in self.pending],
-            "last_ns": self.last_ns,
-            "pauses": list(self.pauses),
-            "seen": list(self.seen),
-            "period_ns": self.period_ns,
-        }
-
-    def load(self, s: State) -> None:
-        self.first, self.known, self.key, self.done = s["first"], s["known"], s["key"], s["done"]
-        self.number = s["number"]
-        self.pending = [(m, t, c, f, list(values)) for m, t, c, f, values in s["pending"]]
-        self.last_ns, self.pauses, self.seen = s["last_ns"], list(s["pauses"]), list(s["seen"])
-        self.period_ns = s["period_ns"]
-
-
 # -------------------------------------------------------------------------------------------------------------- codec
 
 
@@ -241,7 +118,7 @@ class AccelCodec:
     Raises ValueError at construction for settings that cannot be (unknown or ambiguous signal, unit, rotation, ...).
     `ids`: the (extended, identifier) that it listens to. Counters: frames = accepted + duplicates + rejected + pending;
     samples; gaps and lost (missing samples, by the counter or because a frame was refused); incomplete (samples with a
-    missing axis); resets (of the device's counter); saturated (samples).
+    missing axis); resets (of the device's counter); saturated, stuck, spikes (samples).
     """
 
     def __init__(self, settings: AccelerometerSettings) -> None:
@@ -249,9 +126,18 @@ class AccelCodec:
         self._source = settings.name
         self._messages = _messages_of(settings)
         self.ids: frozenset[tuple[bool, int]] = frozenset((m.extended, m.can_id) for m in self._messages)
-        self._assembly = _Assembly(self._messages) if len(self._messages) > 1 else None
+        self._sync = -1 if settings.sync is None else settings.sync
+        self._sync_kind = int(CanFlag.EXT) if self._sync > 0x7FF else 0
+        self._sync_presence = Presence()
+        if self._sync >= 0 and settings.counter is not None:
+            raise ValueError("give either counter or sync: the SYNC numbers the samples")
+        if any(m.extended == bool(self._sync_kind) and m.can_id == self._sync for m in self._messages):
+            raise ValueError(f"sync 0x{self._sync:X} is the identifier of a message that carries an axis")
+        several = len(self._messages) > 1 or self._sync >= 0
+        self._assembly = Assembly(self._messages, self._sync >= 0) if several else None
+        self._wild = [m for m in self._messages if m.wild]
+        self._source_address = -1  # that came first, where the settings name none
         self._unit = UNITS[settings.unit]
-        self._low, self._high = self._bounds()
         self._rotation = _rotation_of(settings)
         # one counter is enough: where each message has one, the assembly has made them equal
         counter = next((m.counter for m in self._messages if m.counter is not None), None)
@@ -265,13 +151,20 @@ class AccelCodec:
         self._learn_count = 0
         self._period_ns = S / settings.rate_hz if settings.rate_hz else 0.0
         self.counters: dict[str, int] = dict.fromkeys(COUNTERS, 0)
+        self._watch = Watch(self._source, *self._bounds(), self.counters)
+
+    def shared(self, other: AccelCodec) -> list[str]:
+        """Identifiers of the messages in which another codec reads the same signals."""
+        return list(dict.fromkeys(m.id_text for m in self._messages if any(m.shares(n) for n in other._messages)))
 
     # ------------------------------------------------------------------------------------------------------- the path
 
     def feed(self, frames: CanFrames) -> tuple[AccelBlock | None, list[Reject | Event]]:
         """Decode this accelerometer's frames of a block: the samples that they complete (None if none), and what was
-        refused or noticed. The block's t_ns is the stamp of the frame that completed the sample."""
+        refused or noticed. The block's t_ns is the stamp of the frame that completed the sample, or of its SYNC."""
         notes: list[Reject | Event] = []
+        if self._wild and self._source_address < 0:
+            self._take_source(frames)
         if self._assembly is not None:
             return self._feed_several(self._assembly, frames, notes), notes
         message = self._messages[0]
@@ -287,9 +180,54 @@ class AccelCodec:
         soft = frames.flags.take(rows.places) & SOFT
         return self._finish(frames, t_ns, rows.values, rows.counter, numbers, soft, 1, notes), notes
 
-    def _take(self, message: _Message, frames: CanFrames, notes: list[Reject | Event]) -> _Rows | None:
+    def _take_source(self, frames: CanFrames) -> None:
+        """The source address of the first frame with one of our PGNs becomes ours."""
+        first = frames.can_id.size
+        for message in self._wild:
+            places = message.places(frames.can_id)
+            places = places[frames.flags[places] & KIND == message.kind]
+            if places.size:
+                first = min(first, int(places[0]))
+        if first < frames.can_id.size:
+            self._source_address = int(frames.can_id[first]) & 0xFF
+
+    def _from_source(self, message: Message, places: I64, frames: CanFrames, notes: list[Reject | Event]) -> I64:
+        """The places of those frames that come from our source address; the others are refused, once."""
+        source = frames.can_id.take(places) & 0xFF
+        ours = source == self._source_address
+        if ours.all():
+            return places
+        if message.leads:
+            others = places[~ours]
+            self.counters["frames"] += others.size
+            taken, other = self._source_address, int(source[~ours][0])
+            detail = (
+                f"{message.id_text} comes from source address 0x{other:02X} too; 0x{taken:02X} came first and is "
+                f"taken: write source_address: 0x{taken:02X} or 0x{other:02X}"
+            )
+            self._reject(notes, frames, others, "SOURCE", detail)
+        own: I64 = places[ours]
+        return own
+
+    def _selected(self, message: Message, places: I64, frames: CanFrames, notes: list[Reject | Event]) -> I64:
+        """The places of those frames that the selectors give to this message; the rest holds other signals."""
+        length = frames.length.take(places)
+        good = length >= message.select_need
+        if not good.all():
+            short = places[~good]
+            if message.leads:
+                self.counters["frames"] += short.size
+                detail = (
+                    f"{message.name}: {int(frames.length[short[0]])} bytes, the selector needs {message.select_need}"
+                )
+                self._reject(notes, frames, short, "SHORT", detail)
+            places, length = places[good], length[good]
+        chosen: I64 = places[message.chosen(frames.data.take(places, axis=0), length)]
+        return chosen
+
+    def _take(self, message: Message, frames: CanFrames, notes: list[Reject | Event]) -> _Rows | None:
         """Pick and decode the frames of one message; None if the block has none."""
-        places = (frames.can_id == message.can_id).nonzero()[0]
+        places = message.places(frames.can_id)
         if not places.size:
             return None
         flags = frames.flags.take(places)
@@ -297,15 +235,21 @@ class AccelCodec:
         if kinds != message.kind or (message.extended and not int(np.bitwise_and.reduce(flags)) & CanFlag.EXT):
             kind = flags & KIND
             remote = places[kind == message.kind | CanFlag.RTR]
-            if remote.size:
+            if remote.size and message.leads:
                 self.counters["frames"] += remote.size
                 detail = f"remote request for {message.name}: carries no data"
                 self._reject(notes, frames, remote, "RTR", detail)
             places = places[kind == message.kind]
-            if not places.size:
-                return None
+        if message.wild:
+            places = self._from_source(message, places, frames, notes)
+        if message.when and places.size:
+            places = self._selected(message, places, frames, notes)
+        if not places.size:
+            return None
         candidates = places.size
         self.counters["frames"] += candidates
+        if message.presence.seen(frames.t_ns, places):
+            self._back(message.name, int(frames.t_ns[places[0]]), notes)
         slots = np.arange(candidates)
         length = frames.length.take(places)
         if np.minimum.reduce(length) < message.need:
@@ -322,12 +266,12 @@ class AccelCodec:
         if message.numbers is not None:
             counter = message.numbers.raw(data, length)[:, 0].astype(np.int64)
         if message.decoder.is_float:
-            good = np.isfinite(values).all(axis=1)
+            good = np.asarray(np.isfinite(values).all(axis=1))
             if not good.all():
                 self._reject(notes, frames, places[~good], "NOT_FINITE", f"{message.name}: NaN or infinite")
                 places, slots, values = places[good], slots[good], values[good]
                 counter = None if counter is None else counter[good]
-        good = (np.abs(values) <= LARGEST_MPS2 / self._unit).all(axis=1)
+        good = np.asarray((np.abs(values) <= LARGEST_MPS2 / self._unit).all(axis=1))
         if not good.all():
             self._reject(notes, frames, places[~good], "RANGE", f"{message.name}: beyond {LARGEST_MPS2:g} m/s2")
             places, slots, values = places[good], slots[good], values[good]
@@ -340,9 +284,22 @@ class AccelCodec:
                 places, slots, values, counter = places[good], slots[good], values[good], counter[good]
         return _Rows(places, slots, candidates, values, counter)
 
-    def _feed_several(self, assembly: _Assembly, frames: CanFrames, notes: list[Reject | Event]) -> AccelBlock | None:
-        """The same where x, y, z come in several messages: merge their rows by arrival, assemble, finish."""
+    def _take_sync(self, frames: CanFrames, notes: list[Reject | Event]) -> _Rows | None:
+        """The SYNCs of a block, with their optional counter (else 0)."""
+        places = (frames.can_id == self._sync).nonzero()[0]
+        places = places[frames.flags[places] & KIND == self._sync_kind]
+        if not places.size:
+            return None
+        if self._sync_presence.seen(frames.t_ns, places):
+            self._back(f"SYNC 0x{self._sync:X}", int(frames.t_ns[places[0]]), notes)
+        counter = np.where(frames.length.take(places) == 1, frames.data[places, 0], 0).astype(np.int64)
+        return _Rows(places, np.arange(places.size), places.size, np.empty((places.size, 0)), counter)
+
+    def _feed_several(self, assembly: Assembly, frames: CanFrames, notes: list[Reject | Event]) -> AccelBlock | None:
+        """The same where a sample is more than one frame: merge their rows by arrival, assemble, finish."""
         taken = [(j, self._take(m, frames, notes)) for j, m in enumerate(self._messages)]
+        if assembly.sync >= 0:
+            taken.append((assembly.sync, self._take_sync(frames, notes)))
         parts = [(j, rows) for j, rows in taken if rows is not None and rows.places.size]
         if not parts:
             return None
@@ -353,7 +310,8 @@ class AccelCodec:
         row = 0
         for j, rows in parts:
             n = rows.places.size
-            values[row : row + n, self._messages[j].axes] = rows.values
+            if j != assembly.sync:
+                values[row : row + n, self._messages[j].axes] = rows.values
             row += n
         waiting = assembly.pending
         msg = np.repeat([j for j, _ in parts], [rows.places.size for _, rows in parts])[order].tolist()
@@ -368,19 +326,26 @@ class AccelCodec:
 
         whole, numbers, broken, duplicates = assembly.run(msg, t_ns, key, soft)
         assembly.pending = [(msg[k], t_ns[k], key[k], soft[k], values[k].tolist()) for k in assembly.open]
-        self.counters["pending"] = len(assembly.pending)
+        self.counters["pending"] = sum(p[0] != assembly.sync for p in assembly.pending)
         self.counters["duplicates"] += duplicates
+        if (
+            assembly.sync >= 0
+        ):  # a SYNC is nobody's frame, and one that no frame follows is a lost sample: its number is missing
+            broken = [b for b in broken if any(msg[k] != assembly.sync for k in b)]
         if broken:
             self.counters["incomplete"] += len(broken)
-            count = sum(len(b) for b in broken)
+            count = sum(msg[k] != assembly.sync for b in broken for k in b)
             self.counters["rejected"] += count
             have = {msg[k] for k in broken[0]}
             missing = ", ".join(m.name for j, m in enumerate(self._messages) if j not in have)
+            if assembly.sync >= 0 and assembly.sync not in have:
+                missing = f"SYNC 0x{self._sync:X}"
             detail = f"{len(broken)} samples with a missing axis; of the first no frame {missing}"
             notes.append(Reject(t_ns[broken[0][-1]], self._source, "INCOMPLETE", detail, count))
         if not whole:
             return None
-        self.counters["accepted"] += len(whole) * assembly.size
+        size = len(self._messages)
+        self.counters["accepted"] += len(whole) * size
         done = np.array(whole)  # (samples, messages): places of their frames
         xyz = np.empty((len(whole), 3))
         which = np.array(msg)[done]
@@ -389,9 +354,8 @@ class AccelCodec:
             for axis in message.axes:
                 xyz[:, axis] = values[source, axis]
         counter = np.array(key)[done].max(axis=1) if self._modulus else None
-        stamps = np.array(t_ns, np.int64)[done[:, -1]]
+        stamps = np.array(t_ns, np.int64)[done[:, -1 if assembly.sync < 0 else 0]]
         softs: U8 = np.bitwise_or.reduce(np.array(soft, np.uint8)[done], axis=1).astype(np.uint8)
-        size = assembly.size
         return self._finish(frames, stamps, xyz, counter, np.array(numbers, np.int64), softs, size, notes)
 
     def _finish(
@@ -433,16 +397,34 @@ class AccelCodec:
 
         if self._unit != 1.0:
             values = values * self._unit
-        hit = (values >= self._high) | (values <= self._low)
-        if np.count_nonzero(hit):
-            saturated = hit.any(axis=1)
-            flags[saturated] |= SATURATED
-            self.counters["saturated"] += int(np.count_nonzero(saturated))
+        t_ns, values, flags, count, soft = self._watch.judge(t_ns, values, flags, count, soft, notes)
+        n = t_ns.size
+        if not n:
+            return None
         if self._rotation is not None:
             r = self._rotation
             values = values[:, 0:1] * r[:, 0] + values[:, 1:2] * r[:, 1] + values[:, 2:3] * r[:, 2]
         self.counters["samples"] += n
         return AccelBlock(self._source, t_ns, values, flags, count, bool(np.bitwise_or.reduce(soft)))
+
+    # ------------------------------------------------------------------------------------------------------- presence
+
+    def silent(self, now_ns: int) -> list[Event]:
+        """One Event for each message that has stopped coming, SILENT_RATIO of its periods ago; `feed` tells its end."""
+        events = []
+        named = [(m.name, m.presence) for m in self._messages]
+        if self._sync >= 0:
+            named.append((f"SYNC 0x{self._sync:X}", self._sync_presence))
+        for name, p in named:
+            if p.stopped(now_ns):
+                silent_s, period_s = (now_ns - p.last_ns) / S, p.period_ns / S
+                text = f"no frame {name} for {silent_s:.1f} s; it came every {period_s * 1000:.3g} ms"
+                values = (("silent_s", silent_s), ("period_s", period_s))
+                events.append(Event(now_ns, "ACCEL_SILENT", self._source, text, values, p.last_ns))
+        return events
+
+    def _back(self, name: str, t_ns: int, notes: list[Reject | Event]) -> None:
+        notes.append(Event(t_ns, "ACCEL_SILENT_END", self._source, f"frames {name} come again"))
 
     # ------------------------------------------------------------------------------------------------- counter, gaps
 
@@ -556,6 +538,9 @@ class AccelCodec:
             "learn_count": self._learn_count,
             "period_ns": self._period_ns,
             "assembly": self._assembly.save() if self._assembly is not None else None,
+            "source_address": self._source_address,
+            "presence": [m.presence.save() for m in self._messages] + [self._sync_presence.save()],
+            "watch": self._watch.save(),
             "counters": dict(self.counters),
         }
 
@@ -569,13 +554,17 @@ class AccelCodec:
         self._period_ns = s["period_ns"]
         if self._assembly is not None:
             self._assembly.load(s["assembly"])
-        self.counters = dict(s["counters"])
+        self._source_address = s["source_address"]
+        for p, kept in zip([m.presence for m in self._messages] + [self._sync_presence], s["presence"], strict=True):
+            p.load(kept)
+        self._watch.load(s["watch"])
+        self.counters.update(s["counters"])  # the watch counts in the same
 
 
 # ------------------------------------------------------------------------------------------------ settings to signals
 
 
-def _messages_of(settings: AccelerometerSettings) -> list[_Message]:
+def _messages_of(settings: AccelerometerSettings) -> list[Message]:
     """The messages that carry x, y, z and the counter. Raises ValueError with what exists."""
     if settings.unit not in UNITS:
         raise ValueError(f"unit {settings.unit!r} is not known; there are: {', '.join(UNITS)}")
@@ -601,44 +590,78 @@ def _messages_of(settings: AccelerometerSettings) -> list[_Message]:
                 )
     else:
         specs = [compile_signal(f"fields[{i}]", f) for i, f in enumerate(settings.fields or ())]
+    specs = [_addressed(spec, settings) for spec in specs]
     for i in range(3):
         for j in range(i):
             a, b = specs[i], specs[j]
-            if (a.extended, a.can_id, a.columns, a.shift) == (b.extended, b.can_id, b.columns, b.shift):
+            if (_frame(a), a.columns, a.shift) == (_frame(b), b.columns, b.shift):
                 raise ValueError(f"{'xyz'[j]} and {'xyz'[i]} are the same signal {a.name}")
-    axes: dict[tuple[bool, int], list[tuple[int, SignalSpec]]] = {}
+    axes: dict[_Frame, list[tuple[int, SignalSpec]]] = {}
     for axis, spec in enumerate(specs):
-        axes.setdefault((spec.extended, spec.can_id), []).append((axis, spec))
-    counters = _counters_of(settings, dbc, set(axes))
-    return [_Message(part, counters.get(key)) for key, part in axes.items()]
+        axes.setdefault(_frame(spec), []).append((axis, spec))
+    counters = _counters_of(settings, dbc, specs)
+    messages: list[Message] = []
+    for frame, part in axes.items():
+        leads = not any((m.extended, m.can_id, m.mask) == frame[:3] for m in messages)
+        messages.append(Message(part, counters.get(frame), leads))
+    for m in messages:  # one that is too short for a selector of any is for none
+        same = [n for n in messages if (n.extended, n.can_id, n.mask) == (m.extended, m.can_id, m.mask)]
+        m.select_need = max(n.select_need for n in same)
+    return messages
+
+
+_Frame: TypeAlias = tuple[bool, int, int, tuple[tuple[SignalSpec, tuple[int, ...]], ...]]
+
+
+def _frame(spec: SignalSpec) -> _Frame:
+    """Which frames hold a signal."""
+    return spec.extended, spec.can_id, spec.mask, spec.when
+
+
+def _addressed(spec: SignalSpec, settings: AccelerometerSettings) -> SignalSpec:
+    """The signal as J1939 finds it, where the DBC file, the field or a source address says that it is J1939."""
+    source = settings.source_address
+    if source is None:
+        return by_pgn(spec, None) if spec.j1939 else spec
+    if not 0 <= source <= 253:
+        raise ValueError(f"source_address {source} must be from 0 to 253")
+    if not spec.extended:
+        raise ValueError(
+            f"source_address is for J1939, whose identifiers have 29 bits; {spec.name} is in 0x{spec.can_id:X}"
+        )
+    return by_pgn(spec, source)
 
 
 def _counters_of(
-    settings: AccelerometerSettings, dbc: Dbc | None, ids: set[tuple[bool, int]]
-) -> dict[tuple[bool, int], SignalSpec]:
+    settings: AccelerometerSettings, dbc: Dbc | None, axes: Sequence[SignalSpec]
+) -> dict[_Frame, SignalSpec]:
     """Counter signal by message: one, or one in each of the messages. Scale and sign of a counter do not matter."""
     if settings.counter is None:
         return {}
     if isinstance(settings.counter, str):
-        found = dbc.find(settings.counter, among=ids) if dbc is not None else []
+        found = dbc.find(settings.counter, among=axes) if dbc is not None else []
     else:
         found = [compile_signal("counter", settings.counter)]
-    result: dict[tuple[bool, int], SignalSpec] = {}
+    frames = dict.fromkeys(_frame(a) for a in axes)
+    result: dict[_Frame, SignalSpec] = {}
     for spec in found:
         if spec.is_float or spec.length > 32:
             raise ValueError(f"counter {spec.name} must be an integer of at most 32 bits")
-        key = (spec.extended, spec.can_id)
-        if key not in ids:
-            there = ", ".join(f"0x{i:X}" for _, i in sorted(ids))
+        spec = replace(_addressed(spec, settings), signed=False, scale=1.0, offset=0.0)
+        # in every frame of its identifier, or in those that the same selectors choose
+        mine = [f for f in frames if f[:3] == _frame(spec)[:3] and f[3][: len(spec.when)] == spec.when]
+        if not mine:
+            there = ", ".join(f"0x{i:X}" for i in sorted({f[1] for f in frames}))
             raise ValueError(f"counter {spec.name} must be in a message that carries an axis ({there})")
-        if key in result:
-            raise ValueError(f"counter {spec.name} is ambiguous: there are two of it in message 0x{spec.can_id:X}")
-        result[key] = replace(spec, signed=False, scale=1.0, offset=0.0)
+        for frame in mine:
+            if frame in result:
+                raise ValueError(f"counter {spec.name} is ambiguous: there are two of it in message 0x{spec.can_id:X}")
+            result[frame] = spec
     if len({s.modulus for s in result.values()}) > 1:
         raise ValueError("the counters of the three messages have different lengths")
-    if len(result) < len(ids):  # cannot match all frames: the first one numbers the samples
-        key = min(result)
-        return {key: result[key]}
+    if len(result) < len(frames):  # cannot match all frames: the first one numbers the samples
+        frame = min(result, key=lambda f: f[:2])
+        return {frame: result[frame]}
     return result
 
 

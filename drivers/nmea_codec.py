@@ -1,8 +1,10 @@
 """NMEA 0183 out of a byte stream that may hold anything else: bytes in, one `GnssFix` per epoch out, no I/O, no clock.
+A receiver with two antennas adds `GnssHeading`s, which are values of their own.
 
 **Sentences.** `$`, printable characters, `*` and two hexadecimal digits, anywhere in the stream: a line end is not
-needed, so binary may run straight into a `$`. Any talker; GGA, GNS, RMC, GST, ZDA and the DOP of GSA are decoded, every
-other sentence with a good checksum is accepted and left alone. A bad sentence changes nothing and becomes a `Reject`:
+needed, so binary may run straight into a `$`. Any talker; GGA, GNS, RMC, GST, ZDA, VTG, HDT, THS, the DOP of GSA and
+Trimble's PTNL,GGK and PTNL,AVR are decoded, every other sentence with a good checksum is accepted and left alone
+(`not_decoded` counts them). A bad sentence changes nothing and becomes a `Reject`:
 
     CHECKSUM     the two digits differ from the exclusive-or, or are no digits
     NO_CHECKSUM  the line ends before a `*`
@@ -19,11 +21,19 @@ begin with `#` (comments, Unicore and NovAtel text logs): counted in `skipped_by
 **Binary.** UBX, RTCM 3, SBF, NovAtel (long, short header) and Unicore frames are skipped by their own length and check,
 so a `$` inside starts nothing. If the check fails, reading resumes one byte on, so nothing good behind it is lost.
 
-**Epochs.** Sentences of one time form an epoch, in any order, whatever is missing. It ends at the type (GGA, GNS or
-GST) that came last in each of the last three epochs with a position, else at the first sentence of another time.
+**Epochs.** Sentences of one time form an epoch, in any order, whatever is missing. It ends at the type (GGK, GGA,
+GNS or GST) that came last in each of the last three epochs with a position, else at the first sentence of another time.
 RMC and ZDA only bring the date, and may come at any rate. Every GGA makes one fix: a second one of the same time
-begins an epoch of its own (`repeated_times` counts them). Position from GGA, else from GNS. A GST that comes too late
-or less often than the position serves the next fixes of the same quality for 1.5 s.
+begins an epoch of its own (`repeated_times` counts them). Position from GGK, else from GGA, else from GNS; what GGK
+does not say (HDOP, separation, age, station) comes from the GGA or GNS of its epoch. A GST that comes too late or less
+often than the position serves the next fixes of the same quality for 1.5 s. VTG has no time: its course and speed go
+with the fix that is given out next, at most 1.5 s later.
+
+**Headings.** Never wait and never hold a fix up. AVR has a time. HDT and THS have none: the first one that stands
+behind a sentence with a new time belongs to that time's epoch, further ones (a compass may be faster than the
+positions) have only their arrival. Of several types in one stream only the best is given out, AVR before THS before
+HDT (`headings_beside` counts the others): they are the same measurement. THS in another mode than A, an empty HDT and
+an AVR of quality 0 are given out as not valid (`headings_invalid`).
 
 **Date.** From RMC (status A) or ZDA; then it runs on by itself through midnight: the day is the one that puts the fix
 nearest to where the last one plus the host's monotonic time says. Without them the day nearest to the host's
@@ -33,7 +43,7 @@ are GPS week roll-overs of old firmware: corrected, with an Event. Second 60 is 
 time, on the following midnight. `utc_ns` 0 = the position came without a time.
 
 Nothing depends on how the bytes were cut: each output carries the stamp of the byte that decided it.
-Left out: AIS (`!`), proprietary solutions (PTNL GGK, PUBX), which later work adds.
+Left out: AIS (`!`), other proprietary solutions (PUBX, PASHR, PSTI).
 """
 
 from __future__ import annotations
@@ -48,24 +58,35 @@ from drivers.nmea_fields import (
     DAY_NS,
     HALF_DAY_NS,
     BadSentenceError,
+    Heading,
     Position,
     day_number,
+    heading,
     nearest_day,
     need_fields,
     number,
     position,
     show,
     time_of_day,
+    trimble_quality,
+    two_digit_day,
+    unit,
+    vector_heading,
+    velocity,
     xor8,
 )
-from edge_agent.messages import Event, GnssFix, Quality, Reject, S, State
+from edge_agent.messages import Event, GnssFix, GnssHeading, Quality, Reject, S, State
 
-Output: TypeAlias = list[GnssFix | Reject | Event]
+Output: TypeAlias = list[GnssFix | GnssHeading | Reject | Event]
 
 DECODED_LIMIT = 120
 OTHER_LIMIT = 1024
 GST_CARRY_NS = 3 * S // 2
 DOP_CARRY_NS = 10 * S
+VELOCITY_CARRY_NS = 3 * S // 2
+HEADING_RANK = {"AVR": 3, "THS": 2, "HDT": 1}
+HEADING_PATIENCE = 20
+"""Lesser heading sentences that pass before the better type counts as gone: 2 s of HDT at 10 Hz beside THS."""
 ROLLOVER_NS = 1024 * 7 * 86400 * S
 DATE_SLACK_NS = 18 * 3600 * S
 """Beyond this distance from the host's clock a day that was only chosen, not told, is chosen anew."""
@@ -115,6 +136,10 @@ class NmeaCodec:
                 "positions",  # of those, with a position of quality > 0
                 "repeated_times",
                 "late_sentences",  # came after their epoch was closed
+                "not_decoded",  # of the accepted ones
+                "headings",  # GnssHeading given out, valid or not
+                "headings_invalid",
+                "headings_beside",
             ),
             0,
         )
@@ -130,6 +155,7 @@ class NmeaCodec:
         self._open = False
         self._key = _EMPTY  # time of day [ns]
         self._kinds: dict[str, str] = {}  # sentence type -> talker, in the order of arrival
+        self._ggk: Position | None = None  # with its DOP for HDOP and the ellipsoidal height for MSL
         self._gga: Position | None = None
         self._gns: Position | None = None
         self._gst: tuple[float, float, float] | None = None
@@ -140,6 +166,10 @@ class NmeaCodec:
         # carried from epoch to epoch
         self._gst_last: tuple[int, int, float, float, float] | None = None  # key, quality, e, n, u
         self._dop: tuple[int, float, float] | None = None  # arrival_ns, pdop, vdop
+        self._velocity: tuple[int, float, float] | None = None  # arrival_ns, course, speed; until a fix takes it
+        self._heading_key = _EMPTY  # the epoch that has its heading
+        self._heading_rank = 0
+        self._heading_beside = 0
         self._separation = math.nan
         self._separation_missing = False
         self._coarse = -1  # -1 not known, 0 fine, 1 coarse
@@ -157,7 +187,11 @@ class NmeaCodec:
             b"GST,": self._on_gst,
             b"ZDA,": self._on_zda,
             b"GSA,": self._on_gsa,
+            b"VTG,": self._on_vtg,
+            b"HDT,": self._on_hdt,
+            b"THS,": self._on_ths,
         }
+        self._proprietary = {b"PTNL,GGK,": self._on_ggk, b"PTNL,AVR,": self._on_avr}
 
     # ------------------------------------------------------------------------------------------------------ the stream
 
@@ -177,6 +211,12 @@ class NmeaCodec:
             return out
         self._keep(buffer, self._scan(buffer, out))
         return out
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that wait for the rest of a sentence or frame: bytes = sentence_bytes + binary_bytes + skipped_bytes +
+        waiting."""
+        return len(self._buffer)
 
     def finish(self) -> Output:
         """The stream is over: reject what is cut off, close the open epoch. For ends that are known, such as a file's;
@@ -268,7 +308,10 @@ class NmeaCodec:
         match = _BODY.match(buffer, pos + 1)
         end = match.end() if match else pos + 1
         size = len(buffer)
-        handler = self._handlers.get(buffer[pos + 3 : pos + 7]) if buffer[pos + 1] != 0x50 else None  # P: proprietary
+        if buffer[pos + 1] != 0x50:
+            handler = self._handlers.get(buffer[pos + 3 : pos + 7])
+        else:  # P: proprietary
+            handler = self._proprietary.get(buffer[pos + 1 : pos + 10])
         limit = OTHER_LIMIT if handler is None else DECODED_LIMIT
         if end - pos > limit - 3:
             at = pos + limit - 3  # the byte that would have to be the `*`
@@ -292,6 +335,8 @@ class NmeaCodec:
                         handler(fields[0][:2], fields, t_ns, hint_ns, out)
                     except BadSentenceError as e:
                         return self._refuse(buffer, pos, last + 1, t_ns, e.reason, e.detail, out)
+                else:
+                    self.counters["not_decoded"] += 1
                 counters = self.counters
                 counters["sentences"] += 1
                 counters["accepted"] += 1
@@ -406,7 +451,7 @@ class NmeaCodec:
             self._gst = std
             self._placed("GST", t_ns, None, out)
         elif tod == self._key and not self._open:  # its fix has gone out; the next ones may use it
-            pos = self._gga or self._gns
+            pos = self._placement()
             if pos is not None and self._gst is None:
                 self._gst_last = (tod, pos[6], *std)
 
@@ -420,8 +465,7 @@ class NmeaCodec:
         if date:
             if len(date) != 6 or date.strip(_DIGITS):
                 raise BadSentenceError("FIELD", f"date {date!r}; ddmmyy would be right")
-            year = int(date[4:])
-            day = day_number(1900 + year if year >= 80 else 2000 + year, int(date[2:4]), int(date[:2]))
+            day = two_digit_day(date[4:], date[2:4], date[:2])
         if date and f[2] == "A" and tod >= 0:  # without a fix many receivers show a date out of thin air
             self._date(day * DAY_NS + tod, t_ns, hint_ns, out)
         self._enter("RMC", talker, tod, out)
@@ -444,12 +488,84 @@ class NmeaCodec:
         vdop = number(f[17], "VDOP", 0.0, 1e4)
         self._dop = (t_ns, pdop, vdop)
 
+    def _on_ggk(self, talker: str, f: list[str], t_ns: int, hint_ns: int, out: Output) -> None:
+        """time, mmddyy, latitude, longitude, quality, satellites, DOP, EHT + ellipsoidal height, M."""
+        need_fields("GGK", f, 12, 13)
+        quality = trimble_quality(f[8])
+        unit(f[12], "M")
+        if f[11] and not f[11].startswith("EHT"):
+            raise BadSentenceError("FIELD", f"height {f[11]!r}; EHT and the ellipsoidal height would be right")
+        tod = time_of_day(f[2])
+        date = f[3]
+        day = 0
+        if date:
+            if len(date) != 6 or date.strip(_DIGITS):
+                raise BadSentenceError("FIELD", f"date {date!r}; mmddyy would be right")
+            if quality > 0:
+                day = two_digit_day(date[4:], date[:2], date[2:4])
+        pos = position(f, 4, int(quality), f[9], f[10], f[11][3:], "", "", "", t_ns, hint_ns)
+        name = f"ggk_quality_{int(f[8])}"  # Trimble's number
+        self.counters[name] = self.counters.get(name, 0) + 1
+        if day and tod >= 0:
+            self._date(day * DAY_NS + tod, t_ns, hint_ns, out)
+        if self._enter("GGK", talker, tod, out):
+            self._ggk = pos
+            self._placed("GGK", t_ns, pos, out)
+
+    def _on_vtg(self, talker: str, f: list[str], t_ns: int, hint_ns: int, out: Output) -> None:
+        need_fields("VTG", f, 9, 10)
+        self._velocity = (t_ns, *velocity(f))
+
+    def _on_hdt(self, talker: str, f: list[str], t_ns: int, hint_ns: int, out: Output) -> None:
+        need_fields("HDT", f, 2, 3)
+        unit(f[2], "T")
+        self._heading("HDT", -1, heading(f[1], True), t_ns, hint_ns, out)
+
+    def _on_ths(self, talker: str, f: list[str], t_ns: int, hint_ns: int, out: Output) -> None:
+        need_fields("THS", f, 3, 3)
+        if len(f[2]) != 1 or f[2] not in "AEMSV":
+            raise BadSentenceError("FIELD", f"mode {f[2]!r}; a letter of AEMSV would be right")
+        self._heading("THS", -1, heading(f[1], f[2] == "A"), t_ns, hint_ns, out)
+
+    def _on_avr(self, talker: str, f: list[str], t_ns: int, hint_ns: int, out: Output) -> None:
+        """time, yaw, "Yaw", tilt, "Tilt", roll, "Roll", range, quality, PDOP, satellites."""
+        need_fields("AVR", f, 11, 13)
+        tod = time_of_day(f[2])
+        self._heading("AVR", tod, vector_heading(f), t_ns, hint_ns, out)
+
+    # -------------------------------------------------------------------------------------------------------- headings
+
+    def _heading(self, kind: str, tod: int, said: Heading, t_ns: int, hint_ns: int, out: Output) -> None:
+        """Give a heading out, unless the stream holds better ones; `tod` -1 = that of the epoch in which it stands."""
+        counters = self.counters
+        rank = HEADING_RANK[kind]
+        if rank < self._heading_rank and self._heading_beside < HEADING_PATIENCE:
+            self._heading_beside += 1
+            counters["headings_beside"] += 1
+            return
+        self._heading_rank = rank
+        self._heading_beside = 0
+        if tod < 0 and self._key != self._heading_key:
+            tod = self._heading_key = self._key
+        utc = self._utc_near(tod, t_ns, hint_ns) if tod >= 0 else 0
+        deg, quality, tilt, baseline, step = said
+        counters["headings"] += 1
+        if quality == Quality.NONE:
+            counters["headings_invalid"] += 1
+        out.append(GnssHeading(0, t_ns, utc, deg, quality, tilt, baseline, step, kind))
+
     # ---------------------------------------------------------------------------------------------------------- epochs
+
+    def _placement(self) -> Position | None:
+        """The position that holds for the epoch: GGK's, else GGA's, else GNS's. A GGK without one hides no other."""
+        ggk = self._ggk
+        other = self._gga or self._gns
+        return ggk if ggk is not None and (ggk[6] > 0 or other is None) else other
 
     def _enter(self, kind: str, talker: str, tod: int, out: Output) -> bool:
         """Find the epoch of a sentence, closing and opening as the module's text says; False = it is in none."""
         key = self._key
-        is_position = kind == "GGA" or kind == "GNS"
+        is_position = kind in ("GGA", "GNS", "GGK")
         if not is_position and tod >= 0 and key >= 0 and tod != key and (tod - key) % DAY_NS > HALF_DAY_NS:
             self.counters["late_sentences"] += 1  # of an earlier epoch
             return False
@@ -460,7 +576,7 @@ class NmeaCodec:
                 return True
             if kind != "GGA":  # each GGA makes a fix, so one more begins an epoch
                 if before is None:
-                    if kind == "GNS" or kind == "GST":
+                    if kind in ("GNS", "GST", "GGK"):
                         self._last_kind = kind
                     self.counters["late_sentences"] += 1
                     return False
@@ -468,30 +584,30 @@ class NmeaCodec:
                     return False  # the standard lets each constellation send its own GNS, GST
         if self._open:
             self._close(out)
-        if self._last_kind and (self._gga is not None or self._gns is not None):
+        if self._last_kind and self._placement() is not None:
             self._history = [*self._history[-2:], self._last_kind]
             same = len(self._history) == 3 and len(set(self._history)) == 1
             self._ender = self._last_kind if same else ""
         self._open = True
         self._key = tod
         self._kinds = {kind: talker}
-        self._gga = self._gns = None
+        self._ggk = self._gga = self._gns = None
         self._gst = None
         self._last_kind = ""
         return True
 
     def _placed(self, kind: str, t_ns: int, pos: Position | None, out: Output) -> None:
-        """A sentence of GGA, GNS, GST has been stored in its epoch: note it, end the epoch if this is its end."""
+        """A sentence of GGK, GGA, GNS, GST has been stored in its epoch: note it, end the epoch if this is its end."""
         self._last_kind = kind
         if pos is not None and pos[6] > 0:
             self.last_position_ns = t_ns
-        if kind == self._ender and (self._gga is not None or self._gns is not None):
+        if kind == self._ender and self._placement() is not None:
             self._close(out)
 
     def _close(self, out: Output) -> None:
         """End the open epoch; give its fix, if it has a position sentence, and the Events that come with it."""
         self._open = False
-        pos = self._gga or self._gns
+        pos = self._placement()
         if pos is None:
             return
         arrival, hint, lat, lon, msl, separation, quality, satellites, hdop, age, station, minutes, step_h = pos
@@ -512,13 +628,22 @@ class NmeaCodec:
         dop = self._dop
         if dop is None or arrival - dop[0] > DOP_CARRY_NS:
             dop = (0, math.nan, math.nan)
+        ellipsoidal = pos is self._ggk
+        if ellipsoidal:
+            dop = (0, hdop, dop[2])
+            other = self._gga or self._gns
+            hdop, separation, age, station = (other[8], other[5], other[9], other[10]) if other else (*_NAN3, "")
+        velocity = self._velocity
+        self._velocity = None
+        if velocity is None or arrival - velocity[0] > VELOCITY_CARRY_NS:
+            velocity = (0, math.nan, math.nan)
         placed = lat == lat and msl == msl
         height = math.nan
         step = _NAN3
         if lat == lat:
             step = (minutes * MINUTE_M * math.cos(math.radians(lat)), minutes * MINUTE_M, step_h)
         if placed:
-            height = msl + self._geoid(separation, quality, arrival, out)
+            height = msl if ellipsoidal else msl + self._geoid(separation, quality, arrival, out)
             if quality > 0:
                 self._decimals(step, arrival, out)
         self.counters["fixes"] += 1
@@ -544,6 +669,8 @@ class NmeaCodec:
                 std or _NAN3,
                 step,
                 tuple(self._kinds),
+                velocity[1],
+                velocity[2],
             )
         )
 
@@ -622,12 +749,15 @@ class NmeaCodec:
         self._utc = utc_ns
         self._utc_at = t_ns
 
-    def _utc_of(self, tod: int, t_ns: int, hint_ns: int, out: Output) -> int:
-        """UTC of a time of day that arrived at `t_ns`."""
+    def _utc_near(self, tod: int, t_ns: int, hint_ns: int) -> int:
+        """UTC of a time of day that arrived at `t_ns`, as far as the calendar is known."""
         if self._utc >= 0:
-            utc = nearest_day(tod, self._utc + t_ns - self._utc_at)
-        else:
-            utc = nearest_day(tod, hint_ns) if hint_ns else DAY_NS + tod
+            return nearest_day(tod, self._utc + t_ns - self._utc_at)
+        return nearest_day(tod, hint_ns) if hint_ns else DAY_NS + tod
+
+    def _utc_of(self, tod: int, t_ns: int, hint_ns: int, out: Output) -> int:
+        """UTC of a time of day that arrived at `t_ns`, from which the calendar goes on."""
+        utc = self._utc_near(tod, t_ns, hint_ns)
         if not self._date_known and hint_ns and abs(utc - hint_ns) > DATE_SLACK_NS:
             moved = nearest_day(tod, hint_ns)
             if self._utc > 2 * DAY_NS + HALF_DAY_NS:
@@ -653,6 +783,7 @@ class NmeaCodec:
             "open": self._open,
             "key": self._key,
             "kinds": [[k, v] for k, v in self._kinds.items()],
+            "ggk": _list(self._ggk),
             "gga": _list(self._gga),
             "gns": _list(self._gns),
             "gst": _list(self._gst),
@@ -662,6 +793,8 @@ class NmeaCodec:
             "fix_key": self._fix_key,
             "gst_last": _list(self._gst_last),
             "dop": _list(self._dop),
+            "velocity": _list(self._velocity),
+            "heading": [self._heading_key, self._heading_rank, self._heading_beside],
             "separation": [self._separation, self._separation_missing],
             "coarse": [self._coarse, self._coarse_run],
             "utc": [self._utc, self._utc_at],
@@ -680,6 +813,7 @@ class NmeaCodec:
         self._open = s["open"]
         self._key = s["key"]
         self._kinds = dict(s["kinds"])
+        self._ggk = None if s["ggk"] is None else tuple(s["ggk"])
         self._gga = None if s["gga"] is None else tuple(s["gga"])
         self._gns = None if s["gns"] is None else tuple(s["gns"])
         self._gst = None if s["gst"] is None else tuple(s["gst"])
@@ -689,6 +823,8 @@ class NmeaCodec:
         self._fix_key = s["fix_key"]
         self._gst_last = None if s["gst_last"] is None else tuple(s["gst_last"])
         self._dop = None if s["dop"] is None else tuple(s["dop"])
+        self._velocity = None if s["velocity"] is None else tuple(s["velocity"])
+        self._heading_key, self._heading_rank, self._heading_beside = s["heading"]
         self._separation, self._separation_missing = s["separation"]
         self._coarse, self._coarse_run = s["coarse"]
         self._utc, self._utc_at = s["utc"]

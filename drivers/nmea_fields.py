@@ -10,7 +10,7 @@ import math
 from functools import lru_cache
 from typing import TypeAlias
 
-from edge_agent.messages import S
+from edge_agent.messages import Quality, S
 
 DAY_NS = 86400 * S
 HALF_DAY_NS = DAY_NS // 2
@@ -131,7 +131,7 @@ def position(
         lon = angle(f[at + 2], f[at + 3], "EW", 180.0)
         step = max(last_step(f[at]), last_step(f[at + 2]))
     elif quality > 0:
-        raise BadSentenceError("FIELD", f"quality {quality} but no position")
+        raise BadSentenceError("FIELD", f"{Quality(quality).name} but no position")
     return (
         t_ns,
         hint_ns,
@@ -147,6 +147,86 @@ def position(
         step,
         last_step(msl) if msl else math.nan,
     )
+
+
+TRIMBLE_QUALITY = (
+    Quality.NONE,  # 0 not available or invalid
+    Quality.SINGLE,  # 1 autonomous
+    Quality.FLOAT,  # 2 RTK float
+    Quality.FIXED,  # 3 RTK fixed
+    Quality.DGNSS,  # 4 code phase only
+    Quality.DGNSS,  # 5 SBAS
+    Quality.FLOAT,  # 6 RTK float or location, 3D network
+    Quality.FIXED,  # 7 RTK fixed, 3D network
+    Quality.FLOAT,  # 8 RTK float or location, 2D network
+    Quality.FIXED,  # 9 RTK fixed, 2D network
+    Quality.FLOAT,  # 10 OmniSTAR HP/XP, decimetres
+    Quality.DGNSS,  # 11 OmniSTAR VBS
+    Quality.FLOAT,  # 12 location RTK
+)
+"""GGK's and AVR's quality, not GGA's. Source: Trimble, SPSx51 Modular GPS Receivers User Guide, tables A.6 and A.8."""
+
+
+def trimble_quality(text: str) -> Quality:
+    """Quality of the PTNL sentences."""
+    if not 1 <= len(text) <= 2 or not text.isdigit():
+        raise BadSentenceError("FIELD", f"quality {text!r}; a number would be right")
+    n = int(text)
+    if n >= len(TRIMBLE_QUALITY):
+        raise BadSentenceError("RANGE", f"quality {text}; 0 to {len(TRIMBLE_QUALITY) - 1} would be right")
+    return TRIMBLE_QUALITY[n]
+
+
+def unit(text: str, right: str) -> None:
+    """Refuse another unit or label than `right`; some receivers leave it out where the value is missing."""
+    if text not in ("", right):
+        raise BadSentenceError("FIELD", f"{text!r}; {right} would be right")
+
+
+KNOT_MPS = 1852.0 / 3600.0
+
+
+def velocity(f: list[str]) -> tuple[float, float]:
+    """Course over ground [deg] and speed [m/s] of VTG, NaN where it does not say; mode N is not valid.
+
+    The speed is that in km/h, whose last decimal is the finer one, else that in knots.
+    """
+    for at, right in ((2, "T"), (4, "M"), (6, "N"), (8, "K")):
+        unit(f[at], right)
+    course = number(f[1], "course", 0.0, 360.0)
+    number(f[3], "magnetic course", 0.0, 360.0)
+    knots, kmh = number(f[5], "speed", 0.0, 1e4), number(f[7], "speed", 0.0, 2e4)
+    if len(f[9]) > 1 or (f[9] and not f[9].isupper()):
+        raise BadSentenceError("FIELD", f"mode {f[9]!r}; one letter would be right")
+    if f[9] == "N":
+        return math.nan, math.nan
+    return course, kmh / 3.6 if kmh == kmh else knots * KNOT_MPS
+
+
+Heading: TypeAlias = tuple[float, Quality, float, float, float]
+"""What a heading sentence says: heading_deg (NaN = none), quality, tilt_deg, baseline_m, step_deg."""
+
+
+def heading(text: str, valid: bool) -> Heading:
+    """Of HDT and THS, which know neither quality nor baseline."""
+    deg = number(text, "heading", 0.0, 360.0)
+    if not valid or deg != deg:
+        return math.nan, Quality.NONE, math.nan, math.nan, math.nan
+    return deg, Quality.FIXED, math.nan, math.nan, last_step(text)
+
+
+def vector_heading(f: list[str]) -> Heading:
+    """Of PTNL,AVR; the yaw may be negative."""
+    for at, right in ((4, "Yaw"), (6, "Tilt"), (8, "Roll")):
+        unit(f[at], right)
+    yaw = number(f[3], "yaw", -360.0, 360.0)
+    tilt = number(f[5], "tilt", -90.0, 90.0)
+    number(f[7], "roll", -180.0, 180.0)
+    baseline = number(f[9], "range", 0.0, 1e6)
+    quality = trimble_quality(f[10])
+    if quality == Quality.NONE or yaw != yaw:
+        return math.nan, Quality.NONE, tilt, baseline, math.nan
+    return (yaw + 360.0 if yaw < 0.0 else yaw), quality, tilt, baseline, last_step(f[3])
 
 
 _MONTH_DAYS = (31, 29, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31)
@@ -165,6 +245,12 @@ def day_number(year: int, month: int, day: int) -> int:
     era_year = y % 400
     day_of_year = (153 * (month + (-3 if month > 2 else 9)) + 2) // 5 + day - 1
     return y // 400 * 146097 + era_year * 365 + era_year // 4 - era_year // 100 + day_of_year - 719468
+
+
+def two_digit_day(year: str, month: str, day: str) -> int:
+    """Days from 1970-01-01; years 80 to 99 are of the last century."""
+    n = int(year)
+    return day_number(1900 + n if n >= 80 else 2000 + n, int(month), int(day))
 
 
 def nearest_day(tod: int, utc_ns: int) -> int:

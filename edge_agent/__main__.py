@@ -81,7 +81,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from edge_agent.config import ConfigError, load
+    from edge_agent.config import ConfigError, load, notes
 
     try:
         config = load(args.config, args.set or ())
@@ -91,8 +91,31 @@ def _check(args: argparse.Namespace) -> int:
         return WANTING
     parts = {k: list(getattr(config, k)) for k in ("ports", "receivers", "accelerometers", "points")}
     names = "; ".join(f"{k}: {', '.join(v) or 'none'}" for k, v in parts.items())
-    _result(args, {"ok": True, "mistakes": [], "site": config.site, **parts}, f"{args.config}: good; {names}")
-    return GOOD
+    from edge_agent import check
+
+    result = {"ok": True, "mistakes": [], "site": config.site, **parts}
+    text = f"{args.config}: good; {names}"
+    if not args.live:
+        # what is not there today is no mistake of the text: it may come, and the service waits for it
+        told = [*notes(config), *(f"{f.where}: {f.text}" for f in check.today(config))]
+        _result(args, {**result, "notes": told}, "\n".join([text, *(f"note: {t}" for t in told)]))
+        return GOOD
+    if not 0.1 <= args.seconds <= 3600:
+        raise WrongUseError(f"--seconds {args.seconds:g}: 0.1 to 3600")
+    from edge_agent.judge import BAD
+    from edge_agent.lock import InUseError
+
+    _say(f"listening to {', '.join(config.ports)} for {args.seconds:g} s")
+    try:
+        found = [*check.live(config, args.seconds), *check.disk(config)]
+    except InUseError as e:
+        raise WrongUseError(f"check --live: {e}") from None
+    told = notes(config)
+    bad = sum(f.level == BAD for f in found)
+    lines = [text, *(f"note: {t}" for t in told), check.as_text(found)]
+    lines.append(f"found wanting: {bad} BAD above" if bad else "live: good")
+    _result(args, {**result, "ok": not bad, "notes": told, "live": check.as_json(found)}, "\n".join(lines))
+    return WANTING if bad else GOOD
 
 
 def _import(args: argparse.Namespace) -> int:
@@ -162,6 +185,8 @@ def _port_and_file(text: str, default: str) -> tuple[str, Path]:
 def _replay(args: argparse.Namespace) -> int:
     if args.output is None and not args.verify:
         raise WrongUseError("replay: give -o OUT for a new recording, --verify to compare, or both")
+    if args.smooth and args.output is None:
+        raise WrongUseError("replay: --smooth writes into the new recording: give -o OUT")
     config = _config(args) if args.config else None
     from edge_agent.config import ConfigError
     from edge_agent.recording.reader import DamagedError
@@ -171,6 +196,11 @@ def _replay(args: argparse.Namespace) -> int:
         if args.set and config is None:
             config = recorded_config(in_order(args.inputs)[0], args.set)
         report = replay(args.inputs, args.output, config, args.verify)
+        if args.smooth:
+            from edge_agent.review.smoothed import add_smoothed
+
+            for point, n in add_smoothed(args.output).items():
+                report.note(f"/fusion/{point}/smoothed: {n} samples")
     except (ReplayError, ConfigError) as e:
         raise WrongUseError(f"replay: {e}") from None
     except DamagedError as e:
@@ -183,12 +213,53 @@ def _replay(args: argparse.Namespace) -> int:
 def _info(args: argparse.Namespace) -> int:
     from edge_agent.cat import describe, describe_text
 
-    try:
-        files, wanting = describe(args.files)
-    except ValueError as e:
-        raise WrongUseError(f"info: {e}") from None
+    files, wanting = describe(args.files)
+    if not any("bytes" in f for f in files):  # none is a recording
+        raise WrongUseError("info: " + "\n".join(f"{f['file']}: {f['damage']}" for f in files))
     _result(args, files, describe_text(files))
     return WANTING if wanting else GOOD
+
+
+def _verify(args: argparse.Namespace) -> int:
+    from edge_agent import verify
+
+    def progress(path: Path) -> None:
+        print(f"\r\x1b[K{path.name}", end="", file=sys.stderr, flush=True)
+
+    talks = sys.stderr.isatty()
+    verdict = verify.verify(args.paths, progress if talks else None)
+    if talks:
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    if not verdict.files:
+        raise WrongUseError(f"verify: no recording in {', '.join(map(str, args.paths))}")
+    _result(args, verify.as_json(verdict), verify.as_text(verdict))
+    if verdict.wanting:
+        return WANTING
+    return LOSS if verdict.lost else GOOD
+
+
+def _review(args: argparse.Namespace) -> int:
+    if args.output is None and not args.json:
+        raise WrongUseError("review: give -o REPORT.html for the page, --json for its figures, or both")
+    from edge_agent.replay import ReplayError
+    from edge_agent.review.report import as_text, review
+
+    talks = sys.stderr.isatty()
+
+    def progress(text: str) -> None:
+        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+
+    try:
+        found, figures = review(args.inputs, args.output, progress if talks else None)
+    except ReplayError as e:
+        raise WrongUseError(f"review: {e}") from None
+    finally:
+        if talks:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    _result(args, figures, as_text(found))
+    if args.output is not None:
+        _say(f"report {args.output}")
+    return LOSS if found.damaged else GOOD
 
 
 def _cat(args: argparse.Namespace) -> int:
@@ -255,6 +326,38 @@ def _recover(args: argparse.Namespace) -> int:
     if any(r.what == "failed" for r in done):
         return WANTING
     return LOSS if any(r.lost_bytes for r in done) else GOOD
+
+
+def _status(args: argparse.Namespace) -> int:
+    import time
+
+    from edge_agent import status, watch
+
+    data_dir = os.path.abspath(_config(args).data_dir) if args.config else None
+    places = watch.places(os.environ, args.dir, data_dir)
+    if args.watch and not args.json:
+        watch.watch(
+            sys.stdout, os.environ, lambda: status.load(places, data_dir), time.time_ns, lambda: time.sleep(1.0)
+        )
+        return GOOD
+    while True:
+        try:
+            path, found = status.load(places, data_dir)
+        except FileNotFoundError as e:
+            hint = "" if args.dir or args.config else "; where the agent was started by hand, name its -c CONFIG"
+            raise WrongUseError(f"{e}: does an agent run here?{hint}") from None
+        except status.StatusError as e:
+            _say(f"edge-agent: status: {e}")
+            return WANTING
+        now = time.time_ns()
+        if args.json:
+            print(json.dumps(watch.report(path, found, now), ensure_ascii=False), flush=True)
+        else:
+            width, _ = watch.size()
+            print(status.render(found, width, None, now, watch.ansi(sys.stdout, os.environ)[1]))
+        if not args.watch:
+            return WANTING if status.problems(found, now) else GOOD
+        time.sleep(1.0)
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -335,9 +438,16 @@ def _parser() -> argparse.ArgumentParser:
     p = add("run", _run, "the service: read the ports, fuse, record, until SIGTERM", "edge-agent run -c site.yaml")
     config_flag(p, required=True)
 
-    p = add("check", _check, "check a configuration: every mistake with its path", "edge-agent check -c site.yaml")
+    p = add(
+        "check",
+        _check,
+        "check a configuration: every mistake with its path; --live: what arrives at its ports",
+        "edge-agent check -c site.yaml\n  edge-agent check --live -c site.yaml",
+    )
     config_flag(p, required=True)
     set_flag(p)
+    p.add_argument("--live", action="store_true", help="open every port for some seconds and say what arrives")
+    p.add_argument("--seconds", type=float, default=10.0, metavar="S", help="how long --live listens (10)")
     json_flag(p)
 
     p = add(
@@ -376,10 +486,40 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--verify", action="store_true", help="compare every derived record with the recorded one, byte for byte"
     )
+    p.add_argument(
+        "--smooth", action="store_true", help="add the smoothed stream, which knows the whole record, to OUT"
+    )
+    json_flag(p)
+
+    p = add("status", _status, "what the running agent says of itself", "edge-agent status --watch")
+    config_flag(p, required=False)
+    p.add_argument(
+        "--dir", action="append", default=[], type=Path, metavar="D", help="where status.json lies, or a data_dir"
+    )
+    p.add_argument("--watch", action="store_true", help="draw it anew each second, until Ctrl-C")
     json_flag(p)
 
     p = add("info", _info, "what recordings hold: times, topics, rates, run, continuity", "edge-agent info rec/*.mcap")
     p.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    json_flag(p)
+
+    p = add(
+        "verify",
+        _verify,
+        "is every file there and as it was written, what is missing and why",
+        "edge-agent verify /var/lib/edge-agent",
+    )
+    p.add_argument("paths", nargs="+", type=Path, metavar="FOLDER|FILE")
+    json_flag(p)
+
+    p = add(
+        "review",
+        _review,
+        "what moved, how much, how sure, at which frequencies, and what went wrong: one page",
+        "edge-agent review /var/lib/edge-agent/recordings -o report.html",
+    )
+    p.add_argument("inputs", nargs="+", type=Path, metavar="FOLDER|FILE")
+    p.add_argument("-o", "--output", type=Path, metavar="REPORT.html", help="the page; it needs nothing but itself")
     json_flag(p)
 
     p = add(

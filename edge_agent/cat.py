@@ -301,11 +301,19 @@ def _finite(value: Any) -> Any:
 def describe(paths: Iterable[Path]) -> tuple[list[dict[str, Any]], bool]:
     """What each file holds, as plain values for JSON, and whether something in one is not as it should be.
 
-    Raises OSError, and ValueError for a file that is no recording.
+    A file that cannot be read has `damage` and nothing else; the others are described all the same.
     """
     files: list[dict[str, Any]] = []
+    unreadable: list[dict[str, Any]] = []
     for path in paths:
-        info = reader.info(path)
+        try:
+            info = reader.info(path)
+        except OSError as e:
+            unreadable.append({"file": str(path), "damage": f"cannot be read: {e.strerror or e}"})
+            continue
+        except ValueError as e:
+            unreadable.append({"file": str(path), "damage": str(e).removeprefix(f"{path}: ")})
+            continue
         empty = info.messages == 0
         seconds = (info.end_ns - info.start_ns) / S
         files.append(
@@ -331,15 +339,34 @@ def describe(paths: Iterable[Path]) -> tuple[list[dict[str, Any]], bool]:
                 "metadata": info.metadata,
                 "continuity": _continuity(path, info.metadata.get(RUN_METADATA, {})),
                 "attachments": {name: size for name, _, size in info.attachments},
+                "missing_before": _missing_before(files, info.metadata.get(RUN_METADATA, {})),
                 "missing_blocks": [
                     {"after_order": gap.after, "before_order": gap.before, "utc": iso(gap.log_ns)} for gap in info.gaps
                 ],
             }
         )
-    wanting = any(
-        f["damage"] or not f["complete"] or f["missing_blocks"] or f["continuity"].startswith(CHANGED) for f in files
+    wanting = bool(unreadable) or any(
+        f["damage"]
+        or not f["complete"]
+        or f["missing_blocks"]
+        or f["missing_before"]
+        or f["continuity"].startswith(CHANGED)
+        for f in files
     )
-    return files, wanting
+    return files + unreadable, wanting
+
+
+def _missing_before(files: Sequence[Mapping[str, Any]], run: Mapping[str, str]) -> int:
+    """How many files of the same run lie between this one and the one of a lower number that was named before it."""
+    number = run.get("segment", "")
+    same = [
+        f["metadata"][RUN_METADATA] for f in files if f["metadata"].get(RUN_METADATA, {}).get("run") == run.get("run")
+    ]
+    before = [int(r["segment"]) for r in same if r.get("segment", "").isdecimal()]
+    if not number.isdecimal() or not run.get("run"):
+        return 0
+    lower = [n for n in before if n < int(number)]
+    return int(number) - max(lower) - 1 if lower else 0
 
 
 CHANGED = "changed"
@@ -368,6 +395,9 @@ def describe_text(files: Sequence[dict[str, Any]]) -> str:
     """`describe` for people."""
     lines: list[str] = []
     for f in files:
+        if "bytes" not in f:
+            lines.append(f"{f['file']}: {f['damage']}")
+            continue
         state = f["damage"] or ("complete" if f["complete"] else "no index: being written or torn, see `recover`")
         lines.append(f"{f['file']}: {f['bytes'] / 1e6:.3f} MB, {f['messages']} messages, {state}")
         if f["begin_utc"]:
@@ -375,6 +405,8 @@ def describe_text(files: Sequence[dict[str, Any]]) -> str:
         for name, values in f["metadata"].items():
             lines.append(f"  {name}: " + ", ".join(f"{k}={_short(v)}" for k, v in values.items() if v))
         lines.append(f"  {f['continuity']}")
+        if f["missing_before"]:
+            lines.append(f"  {f['missing_before']} file(s) of this run before it are missing")
         if f["attachments"]:
             lines.append("  attached: " + ", ".join(f"{k} ({v} bytes)" for k, v in f["attachments"].items()))
         for gap in f["missing_blocks"]:

@@ -5,7 +5,7 @@ stops. A mistake names its path, its line and what would be right, and does not 
 and file names, so they are short and plain. Values are read as YAML 1.2 reads them (`on` and `no` are words, `010` is
 ten, `1e-3` is a number), a key stands once, anchors and aliases are refused, and so is a file above its size limit.
 
-Left out: whether a device exists or answers. That is a property of the day, not of the text.
+Left out: whether a device exists or answers. That is a property of the day, not of the text (`check`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import re
 import reprlib
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +37,17 @@ from edge_agent.messages import (
     RecordSettings,
     SignalField,
     Structure,
+    TriggerSettings,
 )
 
-MAX_YAML_BYTES = 1 << 20
-"""A configuration of 1000 points takes a tenth of it."""
+MAX_YAML_BYTES = 1 << 18
+"""A configuration of 1000 points takes 100 kB; a hostile one of this size costs 100 MB and some seconds to refuse."""
 MAX_FILE_BYTES = 16 << 20
 """The largest DBC files of vehicle makers stay below 10 MiB; each is attached to every segment."""
 MAX_DEPTH = 12
 """The deepest path of a valid file has five steps."""
+MAX_GUESSES = 100
+"""Unknown keys of one file for which the nearest known one is looked up (0.3 ms each)."""
 
 NAME = re.compile(r"[A-Za-z0-9_-]{1,32}\Z")
 NAME_RULE = "a name is 1 to 32 of the characters A-Z a-z 0-9 _ -"
@@ -62,11 +65,18 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "kind": tuple(PORT_KEYS),
     "unit": ("m/s2", "g", "mg", "gal"),
     "byteorder": ("little", "big"),
+    "min_quality": ("fixed", "float", "single"),
+    "axis": ("x", "y", "z", "horizontal", "any"),
+    "fault": (
+        *("PORT_LOST", "PORT_HUNG", "SILENT", "GARBAGE", "NO_MATCH", "NO_POSITION", "BUS_OFF"),
+        *("LOSS", "WRITER_STALLED", "DISK_FULL", "DISK_READ-ONLY", "DISK_IO"),
+    ),
 }
 _INTERFACES = ("socketcan", "slcan", "virtual", "udp_multicast", "pcan", "kvaser", "ixxat", "vector", "gs_usb")
 
-# Smallest and largest allowed value (inclusive) by the last key of the path. Anything else numeric is bounded by the
-# rule in `_check_number`: not negative, and not zero unless its default is.
+NETWORK = re.compile(r"(?:socket|rfc2217)://(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):([0-9]{1,5})(?:\?[\w=&.]*)?\Z")
+
+# Smallest and largest allowed value (inclusive) by the last key of the path. A test asks for a row of each numeric key.
 _LIMITS: dict[str, tuple[float, float]] = {
     "azimuth_deg": (-360.0, 360.0),
     "baud": (300, 4_000_000),
@@ -77,6 +87,9 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "sigma_floor_m": (0.0, 10.0),
     "rate_hz": (0.1, 20_000.0),
     "range_mps2": (0.001, 1e6),
+    "sync": (1, (1 << 29) - 1),
+    "source_address": (0, 253),  # 254 and 255 are nobody's and everybody's
+    "pgn": (0, 0x3FFFF),
     "rotation": (-2.0, 2.0),  # `_check_rotation` says the rest
     "id": (0, (1 << 29) - 1),
     "start": (0, 511),
@@ -92,6 +105,50 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "flush_s": (0.05, 60.0),
     "fsync_s": (0.05, 3600.0),
     "view_hz": (0.1, 1000.0),
+    "above_m": (1e-6, 1e3),
+    "above_mps": (1e-6, 1e3),
+    "above_mps2": (1e-6, 1e3),
+    "before_s": (0.0, 3600.0),
+    "after_s": (0.0, 3600.0),
+    "hold_s": (0.05, 3600.0),
+    "release": (0.01, 1.0),
+    "max_s": (1.0, 7200.0),
+    "clips_gb": (0.001, 1e6),
+    "hook_s": (0.05, 3600.0),
+    # MB; a gateway has 256 MB to 4 GB for everything
+    "inbox_mb": (0.1, 1000.0),
+    "outbox_mb": (0.1, 1000.0),
+    "ring_mb": (0.1, 1000.0),
+    "start_s": (1.0, 3600.0),
+    "reacquire_s": (1.0, 86_400.0),
+    "wait_s": (0.001, 10.0),
+    "invalid_std_horizontal_m": (0.001, 100.0),
+    "invalid_std_vertical_m": (0.001, 100.0),
+    "invalid_outage_s": (0.1, 86_400.0),
+    "degraded_std_m": (1e-5, 100.0),
+    "coast_s": (0.05, 3600.0),
+    "outage_s": (0.05, 3600.0),
+    "lockout_s": (0.1, 86_400.0),
+    "accel_noise_m2ps3": (1e-16, 1.0),
+    "accel_noise_decades": (0.01, 6.0),
+    "bias_walk_m2ps5": (1e-18, 1.0),
+    "bias_walk_decades": (0.01, 6.0),
+    "gnss_only_q_m2ps3": (1e-16, 1.0),
+    "gnss_only_qb_m2ps5": (1e-18, 1.0),
+    "bank_memory_s": (1.0, 1e7),
+    "bank_full_s": (0.1, 1e7),
+    "bank_step_s": (0.01, 3600.0),
+    "r_step": (1e-5, 0.5),
+    "r_least": (1e-4, 1.0),
+    "r_most": (1.0, 1e4),
+    "float_std_m": (0.001, 100.0),
+    "float_tau_s": (0.1, 86_400.0),
+    "float_r_factor": (1.0, 1e4),
+    "accel_mean_s": (0.1, 600.0),
+    "accel_absent_s": (0.05, 3600.0),
+    "accel_lost_s": (0.1, 86_400.0),
+    "accel_settle_s": (0.05, 600.0),
+    "accel_only_std_m": (1e-5, 10.0),
 }
 
 _SECTIONS: dict[str, type] = {
@@ -105,6 +162,7 @@ _TABLES: dict[str, type] = {
     "receivers": ReceiverSettings,
     "accelerometers": AccelerometerSettings,
     "points": PointSettings,
+    "triggers": TriggerSettings,
 }
 _TOP = ("site", "data_dir", *_SECTIONS, *_TABLES)
 
@@ -145,18 +203,45 @@ def parse(
     configuration as overridden, so that a recording made with it never claims another one. Raises ConfigError.
     """
     if len(text.encode("utf-8", "surrogatepass")) > MAX_YAML_BYTES:
-        raise ConfigError([f"the configuration is larger than {MAX_YAML_BYTES >> 20} MiB"])
+        raise ConfigError([f"the configuration is larger than {MAX_YAML_BYTES >> 10} KiB"])
     report = _Report()
     tree = _tree(text, report)
+    read = read_file or (lambda name: _read(base_dir / name, MAX_FILE_BYTES))
+    before: set[tuple[str, str]] = set()
+    if sets:  # what is wrong already without them is not their fault
+        as_written = _Report()
+        _config(_tree(text, _Report()), text, base_dir, read, as_written)
+        before = {(path, said) for path, said, _ in as_written.mistakes}
     for s in sets:
         apply_set(tree, s)
     if sets:
         heading = "".join(f"# --set {json.dumps(s)}\n" for s in sets)
         text = f"{heading}{json.dumps(tree, indent=2, ensure_ascii=False)}\n"
-    config = _config(tree, text, base_dir, read_file or (lambda name: _read(base_dir / name, MAX_FILE_BYTES)), report)
+    config = _config(tree, text, base_dir, read, report)
     if report.mistakes or config is None:
-        raise ConfigError(report.lines())
+        raise ConfigError(report.lines(sets, before))
     return config
+
+
+def notes(config: Config) -> list[str]:
+    """What a good configuration may have forgotten: it runs, but some of what it names is only recorded."""
+    found = []
+    used = {r.port for r in config.receivers.values()} | {a.port for a in config.accelerometers.values()}
+    found += [
+        f"ports.{p}: no receiver or accelerometer reads it: recorded, not decoded"
+        for p in config.ports
+        if p not in used
+    ]
+    for table, key in (("receivers", "receiver"), ("accelerometers", "accelerometer")):
+        fused = {getattr(p, key) for p in config.points.values()}
+        found += [
+            f"{table}.{name}: no point uses it: recorded, not fused"
+            for name in getattr(config, table)
+            if name not in fused
+        ]
+    if not config.points:
+        found.append("points: none: nothing is fused")
+    return found
 
 
 def apply_set(tree: Any, assignment: str) -> None:
@@ -223,11 +308,18 @@ class _Report:
         """Whether a mistake stands at a path or below it."""
         return any(p == path or p.startswith(f"{path}.") for p, _, _ in self.mistakes)
 
-    def lines(self) -> list[str]:
-        return [
-            (f"{path}: " if path else "") + text + (f" (line {line})" if line else "")
-            for path, text, line in sorted(self.mistakes, key=lambda m: m[2])
-        ]
+    def lines(self, sets: Sequence[str] = (), before: Collection[tuple[str, str]] = ()) -> list[str]:
+        """One line of text for each. What is not among the mistakes `before` the overrides `sets` is theirs."""
+        out = []
+        for path, text, line in sorted(self.mistakes, key=lambda m: m[2]):
+            where = f" (line {line})" if line else ""
+            if sets and (path, text) not in before:
+                keys = [s.partition("=")[0].strip() for s in sets]
+                guilty = [s for s, k in zip(sets, keys, strict=True) if _related(path, k)]
+                guilty = guilty or [s for s, k in zip(sets, keys, strict=True) if _related(path, k.rpartition(".")[0])]
+                where = f" ({', '.join(f'--set {s}' for s in guilty or sets)})"
+            out.append((f"{path}: " if path else "") + text + where)
+        return out
 
 
 class _Loader(yaml.SafeLoader):
@@ -321,7 +413,13 @@ def _plain(node: yaml.Node, path: str, report: _Report) -> Any:
 
 
 def _join(path: str, key: str) -> str:
+    key = key if len(key) <= 60 else _show.repr(key)
     return f"{path}.{key}" if path else key
+
+
+def _related(a: str, b: str) -> bool:
+    """Whether one of two paths is the other or lies below it."""
+    return a == b or a.startswith(f"{b}.") or b.startswith(f"{a}.")
 
 
 # ---------------------------------------------------------------------------------------------------- tree to settings
@@ -362,6 +460,7 @@ def _config(tree: Any, text: str, base_dir: Path, read_file: Callable[[str], byt
     files: dict[str, bytes] = {}
     _check_accelerometers(tables, read_file, files, report)
     _check_points(tables, report)
+    _check_triggers(tables, report)
     if report.mistakes:
         return None
     return Config(
@@ -374,6 +473,8 @@ def _config(tree: Any, text: str, base_dir: Path, read_file: Callable[[str], byt
         points=tables["points"],
         fusion=sections["fusion"],
         record=sections["record"],
+        events=sections["events"],
+        triggers=tables["triggers"],
         text=text,
         files=tuple(files.items()),
     )
@@ -394,7 +495,7 @@ def _unknown_keys(value: Mapping[str, Any], known: Iterable[str], path: str, rep
     known = tuple(known)
     for key in value:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
+            near = difflib.get_close_matches(key, known, n=1) if len(report.mistakes) < MAX_GUESSES else []
             there = ", ".join(known) if known else "none"
             report.add(
                 _join(path, key),
@@ -421,10 +522,15 @@ def _build(cls: type, value: Any, path: str, report: _Report, name: str | None =
     _unknown_keys(value, known, path, report)
     hints = typing.get_type_hints(cls)
     made: dict[str, Any] = {} if name is None else {"name": name}
+    if cls is SignalField and value.get("pgn") is not None:
+        if "id" in value:
+            report.add(_join(path, "id"), "give either id or pgn; one of the two")
+        del known["id"]
+        made["can_id"] = 0
     for key, field in known.items():
         if key in value:
             made[field.name] = _convert(value[key], hints[field.name], _join(path, key), report)
-            _check_number(key, field, made[field.name], _join(path, key), report)
+            _check_number(key, made[field.name], _join(path, key), report)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             choices = _CHOICES.get(key)
             report.add(_join(path, key), "is missing" + (f"; one of: {', '.join(choices)}" if choices else ""))
@@ -457,7 +563,8 @@ def _convert(value: Any, hint: Any, path: str, report: _Report) -> Any:
         made = _build(hint, value, path, report)
         return _BAD if made is None or report.wrong(path) else made
     if isinstance(hint, type) and issubclass(hint, enum.Enum):
-        words = {m.name.lower(): m for m in hint}
+        allowed = _CHOICES.get(path.rpartition(".")[2])
+        words = {m.name.lower(): m for m in hint if allowed is None or m.name.lower() in allowed}
         if isinstance(value, str) and value.lower() in words:
             return words[value.lower()]
         report.add(path, f"must be one of: {', '.join(words)}; not {_show.repr(value)}")
@@ -507,22 +614,17 @@ def _convert_tuple(value: Any, args: tuple[Any, ...], path: str, report: _Report
     return _BAD if any(i is _BAD for i in items) else tuple(items)
 
 
-def _check_number(key: str, field: dataclasses.Field[Any], value: Any, path: str, report: _Report) -> None:
+def _check_number(key: str, value: Any, path: str, report: _Report) -> None:
     """Range of a number or of each number in a (nested) tuple."""
     if isinstance(value, tuple):
         for v in value:
-            _check_number(key, field, v, path, report)
+            _check_number(key, v, path, report)
         return
     if isinstance(value, bool | enum.Enum) or not isinstance(value, int | float) or key == "reference_llh":
         return
-    if key in _LIMITS:
-        low, high = _LIMITS[key]
-        if not low <= value <= high:
-            report.add(path, f"must be from {low:g} to {high:g}, not {value:g}")
-        return
-    zero_allowed = field.default == 0
-    if value < 0 or (value == 0 and not zero_allowed):
-        report.add(path, f"must be {'0 or more' if zero_allowed else 'above 0'}, not {value:g}")
+    low, high = _LIMITS.get(key, (-math.inf, math.inf))
+    if not low <= value <= high:
+        report.add(path, f"must be from {low:g} to {high:g}, not {value:g}")
 
 
 # -------------------------------------------------------------------------------------------- what one key cannot know
@@ -561,6 +663,8 @@ def _check_ports(tree: Mapping[str, Any], ports: Mapping[str, PortSettings | Non
             continue
         if port.kind == "serial" and not port.device and not report.wrong(f"{path}.device"):
             report.add(f"{path}.device", "is missing: the path of the serial device, best of /dev/serial/by-id/")
+        if port.kind == "serial" and port.device:
+            _check_device(port.device, f"{path}.device", report)
         if port.kind == "can":
             if port.interface not in _INTERFACES:
                 _check_interface(port.interface, f"{path}.interface", report)
@@ -572,6 +676,18 @@ def _check_ports(tree: Mapping[str, Any], ports: Mapping[str, PortSettings | Non
         if wire in taken:
             report.add(path, f"opens the same {port.kind} device as ports.{taken[wire]}")
         taken.setdefault(wire, name)
+
+
+def _check_device(device: str, path: str, report: _Report) -> None:
+    if "://" in device:
+        network = NETWORK.match(device)
+        if network is None or not 0 < int(network[1]) < 65536:
+            report.add(path, f"must be socket://HOST:PORT or rfc2217://HOST:PORT, not {_show.repr(device)}")
+    elif not device.startswith("/"):
+        report.add(
+            path,
+            f"must be a path such as /dev/{device.rpartition('/')[2]} or socket://HOST:PORT, not {_show.repr(device)}",
+        )
 
 
 def _check_interface(interface: str, path: str, report: _Report) -> None:
@@ -616,8 +732,6 @@ def _check_receivers(tables: Mapping[str, Mapping[str, Any]], report: _Report) -
         if receiver.port and receiver.port in of_port:
             report.add(f"{path}.port", f"receivers.{of_port[receiver.port]} already reads port {receiver.port!r}")
         of_port.setdefault(receiver.port, name)
-        if receiver.heading:
-            report.add(f"{path}.heading", "heading is not evaluated by this version; remove the key or set it to false")
 
 
 def _check_accelerometers(
@@ -637,7 +751,8 @@ def _check_accelerometers(
             except KeyError:
                 report.add(f"{path}.dbc", f"the file {_show.repr(accel.dbc)} is not there")
             except OSError as e:
-                report.add(f"{path}.dbc", f"cannot be read: {e.strerror or e}")
+                where = f": {e.filename}" if e.filename else ""
+                report.add(f"{path}.dbc", f"cannot be read: {e.strerror or e}{where}")
         if any(report.wrong(f"{path}.{key}") for key in ("dbc", "signals", "fields", "counter")):
             continue
         before = len(report.mistakes)
@@ -653,8 +768,8 @@ def _check_accelerometers(
             report.add(f"{path}.{'signals' if accel.signals else 'fields'}", "two axes name the same signal")
         if len(report.mistakes) > before:
             continue
-        if report.wrong(f"{path}.unit"):
-            continue  # the codec would compare the unit with that of the DBC file
+        if any(report.wrong(f"{path}.{key}") for key in ("unit", "rate_hz", "range_mps2", "sync", "source_address")):
+            continue  # the codec would say it again, or compare the unit with that of the DBC file
         if report.wrong(f"{path}.rotation"):
             accel = dataclasses.replace(accel, rotation=AccelerometerSettings(name, "").rotation)
         if accel.dbc is not None:
@@ -665,8 +780,8 @@ def _check_accelerometers(
             listening.append((accel, codec))
     for i, (a, codec_a) in enumerate(listening):
         for b, codec_b in listening[:i]:
-            if a.port == b.port and codec_a.ids & codec_b.ids and _axes(a) & _axes(b):
-                ids = ", ".join(f"0x{can_id:X}" for _, can_id in sorted(codec_a.ids & codec_b.ids))
+            ids = ", ".join(codec_a.shared(codec_b)) if a.port == b.port else ""
+            if ids:
                 report.add(
                     f"accelerometers.{a.name}", f"reads the same signals of CAN id {ids} as accelerometers.{b.name}"
                 )
@@ -716,18 +831,14 @@ def _codec(accel: AccelerometerSettings, path: str, report: _Report) -> Any:
     key = "signals" if accel.signals is not None else "fields"
     if "unit says" in text:
         key = "unit"
+    elif text.startswith(("sync ", "source_address ")):
+        key = text.partition(" ")[0]
     elif accel.counter is not None:
         with contextlib.suppress(ValueError):
             AccelCodec(dataclasses.replace(accel, counter=None))
             key = "counter"  # without it all is well
     report.add(f"{path}.{key}", text)
     return None
-
-
-def _axes(accel: AccelerometerSettings) -> set[Any]:
-    if accel.fields is not None:
-        return {(f.extended, f.can_id, f.start, f.length) for f in accel.fields}
-    return {s.rpartition(".")[2] for s in accel.signals or ()}
 
 
 def _check_points(tables: Mapping[str, Mapping[str, Any]], report: _Report) -> None:
@@ -751,6 +862,25 @@ def _check_points(tables: Mapping[str, Mapping[str, Any]], report: _Report) -> N
         pairs.setdefault(pair, name)
 
 
+def _check_triggers(tables: Mapping[str, Mapping[str, Any]], report: _Report) -> None:
+    for name, t in tables["triggers"].items():
+        path = f"triggers.{name}"
+        if t is None or report.wrong(path):
+            continue
+        given = [key for key in ("above_m", "above_mps", "above_mps2", "fault") if getattr(t, key) is not None]
+        if len(given) != 1:
+            report.add(path, "give one of above_m, above_mps, above_mps2 or fault")
+        elif given == ["fault"]:
+            if t.point is not None:
+                report.add(f"{path}.point", "does not go with fault; remove one of them")
+        elif t.point is None:
+            report.add(f"{path}.point", "is missing: the point whose motion is watched")
+        elif _check_reference(t, "point", "points", path, tables, report) and given == ["above_mps2"]:
+            point = tables["points"][t.point]
+            if point is not None and point.accelerometer is None:
+                report.add(f"{path}.above_mps2", f"points.{t.point} has no accelerometer")
+
+
 # --------------------------------------------------------------------------------------------------------------- files
 
 
@@ -761,7 +891,7 @@ def _read(path: Path, limit: int) -> bytes:
     with path.open("rb") as f:
         data = f.read(limit + 1)
     if len(data) > limit:
-        raise OSError(f"larger than {limit >> 20} MiB")
+        raise OSError(f"larger than {limit >> 10} KiB")
     return data
 
 

@@ -1,4 +1,5 @@
-"""`edge-agent demo`: a simulated bridge plays in real time into the live agent; ends with a picture and its figures.
+"""`edge-agent demo`: a simulated bridge plays in real time into the live agent; ends with a picture,
+its figures and the report.
 
 The agent is the real one, its own process, started from a configuration file as a service would be. It reads a
 pseudo-terminal that plays the GNSS receiver, and a CAN bus: vcan0 where the kernel has it up, else an slcan adapter
@@ -26,6 +27,7 @@ import numpy as np
 from edge_agent.geodesy import Frame
 from edge_agent.messages import F64, I64, MS, U8, VALID_MODES, S, Verdict
 from edge_agent.recording import cdr, reader, topics
+from edge_agent.review.report import review
 from edge_agent.simulate.bridge import SimRecord, run
 from edge_agent.simulate.encode import RECEIVER, Wiring, config_yaml, dbc_text, point_name
 from edge_agent.simulate.play import Sink, Terminal, can_schedule, open_can, play, serial_schedule, wait_ready
@@ -118,6 +120,9 @@ def run_demo(out_dir: Path, seconds: float = 60.0, seed: int = 1) -> int:
     draw(picture, seen, record, figures)
     print(figures.line(sum(f.stat().st_size for f in files), len(files)))
     print(f"picture  {picture}")
+    report = folder / "report.html"
+    review([folder / "recordings"], report)
+    print(f"report   {report}")
     for file in files:
         print(f"file     {file}")
     if not figures.better:

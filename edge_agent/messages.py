@@ -9,6 +9,7 @@ the project.
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
@@ -122,6 +123,27 @@ class GnssFix:
     std_enu_m: tuple[float, float, float]  # of GST
     resolution_enu_m: tuple[float, float, float]  # one step of the last decimal
     sentences: tuple[str, ...]  # e.g. ("GGA", "GST"), in the order of arrival
+    course_deg: float = math.nan  # over ground, clockwise from true north; of VTG
+    speed_mps: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class GnssHeading:
+    """One heading of a receiver with two antennas: the azimuth from the first antenna to the second.
+
+    Times as in `GnssFix`; `utc_ns` 0 = the sentence has no time of its own and does not stand first in its epoch.
+    `quality` NONE = the receiver says that it is not valid, FIXED = fixed, or the sentence does not tell.
+    """
+
+    t_ns: int
+    arrival_ns: int
+    utc_ns: int
+    heading_deg: float  # 0 to 360, clockwise from true north
+    quality: Quality
+    tilt_deg: float  # second antenna above the first
+    baseline_m: float  # between the antennas
+    resolution_deg: float  # one step of the last decimal
+    sentence: str  # AVR, THS or HDT
 
 
 class AccelFlag(enum.IntFlag):
@@ -133,6 +155,10 @@ class AccelFlag(enum.IntFlag):
     SPIKE = 8
     FITTED = 16  # time from the counter or the rate, not from an arrival stamp
     INCOMPLETE = 32  # an axis of the sample was missing and holds NaN
+
+
+STUCK_SAMPLES = 48
+"""So many samples before the first that is flagged STUCK may already have been so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,6 +274,24 @@ class Innovation:
 
 
 @dataclass(frozen=True, slots=True)
+class HeadingEstimate:
+    """The heading filter's word on one heading; NaN before its start. ratio = nu^2 / S / chi2(.999, 1); fits iff <= 1.
+
+    `heading_deg` 0 to 360 and `std_deg` are the estimate with this heading in it, `measured_deg` what the receiver
+    said, `std_measured_deg` the sd it was used with."""
+
+    t_ns: int
+    heading_deg: float
+    std_deg: float
+    measured_deg: float
+    std_measured_deg: float
+    tilt_deg: float  # as the receiver said
+    baseline_m: float
+    ratio: float
+    verdict: Verdict
+
+
+@dataclass(frozen=True, slots=True)
 class Estimate:
     """A block of the fused stream of one point: t_ns (n,), displacement/velocity and their sd (n, 3) in m and m/s,
     mode (n,) uint8 of `Mode`, flags (n,) uint8 of `FusionFlag`; bias (3,) m/s2 and offset (3,) m with their sd (3,) at
@@ -325,7 +369,7 @@ class ReceiverSettings:
     latency_ms: float | None = None  # None = learned against a synchronised host clock
     sigma_floor_m: tuple[float, float, float] = (0.001, 0.001, 0.002)  # no RTK receiver is better than 1/1/2 mm
     min_quality: Quality = Quality.FLOAT  # FLOAT: fixed and float are used; FIXED: fixed only; SINGLE: anything
-    heading: bool = False
+    heading: bool = False  # most receivers have one antenna
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,6 +385,7 @@ class SignalField:
     scale: float = 1.0
     offset: float = 0.0
     extended: bool = False
+    pgn: int | None = None  # J1939: stands for `can_id`; any priority, source as `source_address` says
 
 
 @dataclass(frozen=True, slots=True)
@@ -353,6 +398,8 @@ class AccelerometerSettings:
     signals: tuple[str, str, str] | None = None  # x, y, z: "Message.Signal" or "Signal"
     fields: tuple[SignalField, SignalField, SignalField] | None = None
     counter: str | SignalField | None = None
+    sync: int | None = None  # CANopen: identifier of the SYNC at which the sensor samples; None = it samples by itself
+    source_address: int | None = None  # J1939: whose messages; None = of a PGN anybody's, if only one sends it
     rate_hz: float | None = None  # None = learned
     range_mps2: float | None = None  # full scale; beyond 0.999 of it a sample is SATURATED
     rotation: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -421,8 +468,30 @@ class RecordSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class TriggerSettings:
+    """When an event begins: one of three thresholds on a point's fused motion, or a kind of fault."""
+
+    name: str
+    point: str | None = None
+    axis: str = "any"  # x, y, z: its size; horizontal: length of x and y; any: the largest of x, y, z
+    above_m: float | None = None  # displacement
+    above_mps: float | None = None  # velocity
+    above_mps2: float | None = None  # acceleration, without gravity
+    fault: str | None = None  # a kind on /faults, e.g. PORT_LOST
+
+
+@dataclass(frozen=True, slots=True)
 class EventSettings:
-    """Thresholds for event clips (written by later work)."""
+    """What is kept of an event, and when it is over."""
+
+    before_s: float = 10.0  # kept before its begin: a lorry's whole way onto a long span
+    after_s: float = 20.0  # and after its end: a lightly damped mode rings so long
+    hold_s: float = 5.0  # over after so long below the release: longer than the period of any structure
+    release: float = 0.8  # of the threshold: noise about it is one event
+    max_s: float = 600.0  # longest clip: a level that stays above would never end it; the segments hold the rest
+    clips_gb: float = 2.0  # all clips together; beyond it new ones are refused, none is ever deleted
+    hook: tuple[str, ...] | None = None  # program and arguments; the clip's path comes behind
+    hook_s: float = 30.0  # it is killed after so long: a mail that cannot be sent must not hold up the next clip
 
 
 @dataclass(frozen=True, slots=True)
@@ -436,6 +505,8 @@ class Config:
     points: Mapping[str, PointSettings]
     fusion: FusionSettings = field(default_factory=FusionSettings)
     record: RecordSettings = field(default_factory=RecordSettings)
+    events: EventSettings = field(default_factory=EventSettings)
+    triggers: Mapping[str, TriggerSettings] = field(default_factory=dict)
     text: str = ""  # the YAML as read; goes into every segment
     files: tuple[tuple[str, bytes], ...] = ()  # every file that it names, with its content
 

@@ -15,8 +15,9 @@ class Notifier:
             self._address = "\0" + address[1:]
 
     def send(self, *lines: str) -> None:
-        """One message; a supervisor that cannot be reached is no reason to stop recording."""
+        """One message; a supervisor that cannot be reached, or does not read, is no reason to stop recording."""
         if not self._address:
             return
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as s:
+            s.setblocking(False)
             s.sendto("\n".join(lines).encode(), self._address)

@@ -6,6 +6,7 @@ bytes. Everything that `step` depends on is in `save()`.
 
     Raw --- Tick ------> WallMap --------------------------------------------> CLOCK events, rotation asked for
      |----- bytes -----> NmeaCodec --> FixClock ---> Frame, R rule --> Station.fix ----------|
+     |                           `--> its time ----> HeadingFilter --------------------------|
      `----- CanFrames -> AccelCodec -> DeviceClock ------------------> Station.accelerations -+-> Records
 
 Left out: queues, files and faults (runtime), reading recordings back (replay).
@@ -18,19 +19,21 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, Protocol
-
-import numpy as np
+from typing import Any, Protocol, TypeAlias
 
 from edge_agent import messages as m
 from edge_agent.fusion import noise
+from edge_agent.fusion.heading import HeadingFilter
 from edge_agent.fusion.station import Station
 from edge_agent.geodesy import Frame
 from edge_agent.recording import topics
 from edge_agent.state import pack, unpack
 from edge_agent.timebase import STEP_NS, DeviceClock, FixClock, WallMap, with_times
+from edge_agent.triggers import Triggers
 
-STATE_VERSION = 1
+STATE_VERSION = 2
+SLOW_VERSION = 1
+"""Of what outlives a run, which a newer program must still adopt: else an update would move the zero."""
 FOLD_NS = m.S
 """Repeats of one Reject within this much Raw time become one record with a count."""
 
@@ -41,7 +44,11 @@ RANK = {m.Quality.FIXED: 3, m.Quality.FLOAT: 2, m.Quality.DGNSS: 1, m.Quality.SI
 class SerialCodec(Protocol):
     counters: dict[str, int]
 
-    def feed(self, t_ns: int, data: bytes, utc_hint_ns: int) -> list[m.GnssFix | m.Reject | m.Event]: ...
+    @property
+    def waiting(self) -> int: ...
+    def feed(
+        self, t_ns: int, data: bytes, utc_hint_ns: int
+    ) -> list[m.GnssFix | m.GnssHeading | m.Reject | m.Event]: ...
     def save(self) -> m.State: ...
     def load(self, s: m.State) -> None: ...
 
@@ -50,6 +57,7 @@ class FrameCodec(Protocol):
     counters: dict[str, int]
 
     def feed(self, frames: m.CanFrames) -> tuple[m.AccelBlock | None, list[m.Reject | m.Event]]: ...
+    def silent(self, now_ns: int) -> list[m.Event]: ...
     def save(self) -> m.State: ...
     def load(self, s: m.State) -> None: ...
 
@@ -57,10 +65,12 @@ class FrameCodec(Protocol):
 class Receiver:
     """What the path keeps for one GNSS receiver."""
 
-    def __init__(self, settings: m.ReceiverSettings, structure: m.Structure, codec: SerialCodec) -> None:
+    def __init__(self, settings: m.ReceiverSettings, config: m.Config, codec: SerialCodec) -> None:
+        structure = config.structure
         self.settings = settings
         self.codec = codec
         self.clock = FixClock(settings.latency_ms)
+        self.heading = HeadingFilter(settings.name, config.fusion) if settings.heading else None
         self.azimuth_deg = structure.azimuth_deg
         self.reference = structure.reference_llh
         self.frame = None if self.reference is None else Frame(self.reference, self.azimuth_deg)
@@ -77,11 +87,18 @@ class Accelerometer:
     def __init__(self, settings: m.AccelerometerSettings, codec: FrameCodec) -> None:
         self.settings = settings
         self.codec = codec
-        self.clock = DeviceClock(settings.rate_hz, settings.counter is not None)
+        self.clock = DeviceClock(settings.rate_hz, settings.counter is not None or settings.sync is not None)
+
+
+Seen: TypeAlias = m.GnssFix | m.HeadingEstimate | m.AccelBlock | m.Estimate | m.Innovation | m.Event | m.Reject
 
 
 class Pipeline:
-    """The data path for one configuration. `rotate_due` holds the reason when a new segment must begin (clock step)."""
+    """The data path for one configuration. `rotate_due` holds the reason when a new segment must begin (clock step).
+
+    `tap(name, value)` is shown every decoded and fused value by the name of its receiver, accelerometer or point, for
+    those who watch the path while it runs; nothing comes back from it.
+    """
 
     def __init__(
         self,
@@ -90,10 +107,12 @@ class Pipeline:
         frame_codecs: Mapping[str, FrameCodec],
     ) -> None:
         self.config = config
-        self.receivers = {k: Receiver(s, config.structure, serial_codecs[k]) for k, s in config.receivers.items()}
+        self.receivers = {k: Receiver(s, config, serial_codecs[k]) for k, s in config.receivers.items()}
         self.accelerometers = {k: Accelerometer(s, frame_codecs[k]) for k, s in config.accelerometers.items()}
         unset = frozenset(k for k, r in self.receivers.items() if r.reference is None)
         self.station = Station(list(config.points.values()), config.fusion, unset)
+        self.triggers = Triggers(config.triggers.values(), config.events, config.points)
+        self.tap: Callable[[str, Seen], None] = lambda name, value: None
         self.wall = WallMap()
         self.order = 0  # of the next Raw
         self.rotate_due: str | None = None
@@ -126,6 +145,8 @@ class Pipeline:
             else:
                 self._serial(out, raw, raw.payload)
         self._fused(out, self.station.advance(raw.t_ns))
+        for event in self.triggers.expire(raw.t_ns):
+            self._event(out, event)
         self._unfold(out, raw.t_ns)
         return out
 
@@ -136,6 +157,8 @@ class Pipeline:
         return out
 
     def _tick(self, t_ns: int, tick: m.Tick) -> None:
+        for name, accelerometer in self.accelerometers.items():
+            self._pending_events += [replace(e, source=name) for e in accelerometer.codec.silent(t_ns)]
         self.wall.tick(t_ns, tick)
         offset = self.wall.offset_ns
         if offset is None:
@@ -157,6 +180,8 @@ class Pipeline:
             for item in receiver.codec.feed(raw.t_ns, data, hint):
                 if isinstance(item, m.GnssFix):
                     self._fix(out, name, receiver, item)
+                elif isinstance(item, m.GnssHeading):
+                    self._heading(out, name, receiver, item)
                 elif isinstance(item, m.Reject):
                     self._reject(out, replace(item, source=name))
                 else:
@@ -165,6 +190,7 @@ class Pipeline:
     def _fix(self, out: list[m.Record], name: str, receiver: Receiver, fix: m.GnssFix) -> None:
         t_ns, uncertain, step = receiver.clock.time(fix, self.wall)
         fix = replace(fix, t_ns=t_ns)
+        self.tap(name, fix)
         if step:
             text = f"the receiver's time moved by {step / m.S:+.3f} s; fix times follow arrival until it holds"
             self._event(out, m.Event(t_ns, "GNSS_TIME_STEP", name, text, (("step_s", step / m.S),)))
@@ -200,6 +226,21 @@ class Pipeline:
         )
         self._fused(out, self.station.fix(name, measurement, self._now))
 
+    def _heading(self, out: list[m.Record], name: str, receiver: Receiver, seen: m.GnssHeading) -> None:
+        """A heading goes to its own filter and to the topics of the receiver's points, never into a position."""
+        if receiver.heading is None:
+            return
+        seen = replace(seen, t_ns=receiver.clock.time_of(seen.utc_ns, seen.arrival_ns))
+        good = RANK.get(seen.quality, 0) >= RANK.get(receiver.settings.min_quality, 1)
+        for item in receiver.heading.update(seen, good):
+            if isinstance(item, m.Event):
+                self._event(out, item)
+                continue
+            self.tap(name, item)
+            for point in self.config.points.values():
+                if point.receiver == name:
+                    self._put(out, f"/fusion/{point.name}/heading", item.t_ns, partial(topics.heading, item))
+
     def _can(self, out: list[m.Record], raw: m.Raw, frames: m.CanFrames) -> None:
         blocks: dict[str, m.AccelBlock] = {}
         for name, accelerometer in self.accelerometers.items():
@@ -216,7 +257,10 @@ class Pipeline:
             t_ns, gap = accelerometer.clock.times(block)
             blocks[name] = with_times(block, t_ns, t_ns is not block.t_ns, gap)
         for name, block in blocks.items():
+            self.tap(name, block)
             self._accel(out, name, block)
+            for event in self.triggers.accelerations(name, block):
+                self._event(out, event)
         if blocks:
             self._fused(out, self.station.accelerations(blocks, raw.t_ns))
 
@@ -233,11 +277,15 @@ class Pipeline:
     def _fused(self, out: list[m.Record], items: Iterable[m.Estimate | m.Innovation | m.Event]) -> None:
         for item in items:
             if isinstance(item, m.Estimate):
+                self.tap(item.point, item)
                 topic = f"/fusion/{item.point}"
                 self._put(out, topic + "/block", int(item.t_ns[0]), partial(topics.fused_block, item))
                 for i in self._view(topic, item.t_ns):
                     self._put(out, topic + "/state", int(item.t_ns[i]), partial(topics.fused_state, item, i))
+                for event in self.triggers.estimate(item):
+                    self._event(out, event)
             elif isinstance(item, m.Innovation):
+                self.tap(item.point, item)
                 self._put(out, f"/fusion/{item.point}/update", item.t_ns, partial(topics.fusion_update, item))
             else:
                 self._event(out, item)
@@ -258,8 +306,9 @@ class Pipeline:
             return []
         cell = t_ns // int(m.S / self.config.record.view_hz)
         before = self._view_cell.get(topic, -1)
-        self._view_cell[topic] = int(cell[-1])
-        return [int(i) for i in np.flatnonzero(np.diff(cell, prepend=before) > 0)]
+        cells = cell.tolist()
+        self._view_cell[topic] = cells[-1]
+        return [i for i, (a, b) in enumerate(zip([before, *cells], cells, strict=False)) if b > a]
 
     def _put(self, out: list[m.Record], topic: str, t_ns: int, encode: Callable[[int], bytes]) -> None:
         """A derived record: log_time = that of its cause, publish_time = measurement time; neither steps back."""
@@ -268,6 +317,7 @@ class Pipeline:
         out.append(m.Record(topic, self._log, publish, encode(publish), True))
 
     def _event(self, out: list[m.Record], e: m.Event) -> None:
+        self.tap(e.source, e)
         begin = e.begin_ns + self._offset if e.begin_ns else None
         end = e.end_ns + self._offset if e.end_ns else None
         self._put(
@@ -278,6 +328,7 @@ class Pipeline:
         )
 
     def _reject(self, out: list[m.Record], reject: m.Reject) -> None:
+        self.tap(reject.source, reject)
         key = (reject.source, reject.reason)
         held = self._folded.get(key)
         if held is None:
@@ -355,6 +406,7 @@ class Pipeline:
                         "frame": None if r.frame is None else list(r.frame.reference_llh),
                         "reference": None if r.reference is None else list(r.reference),
                         "provisional": r.provisional,
+                        "heading": None if r.heading is None else r.heading.save(),
                     }
                     for k, r in self.receivers.items()
                 },
@@ -362,6 +414,7 @@ class Pipeline:
                     k: {"codec": a.codec.save(), "clock": a.clock.save()} for k, a in self.accelerometers.items()
                 },
                 "station": self.station.save(),
+                "triggers": self.triggers.save(),
             }
         )
 
@@ -370,8 +423,14 @@ class Pipeline:
         s = unpack(data)
         if not isinstance(s, dict) or s.get("version") != STATE_VERSION:
             raise ValueError(f"checkpoint: version {STATE_VERSION} expected")
-        if s["config"] != self._fingerprint:
+        if s.get("config") != self._fingerprint:
             raise ValueError("checkpoint: made with other settings of ports, sensors, points or fusion")
+        try:
+            self._load(s)
+        except (AttributeError, IndexError, KeyError, OverflowError, TypeError) as e:
+            raise ValueError(f"checkpoint: damaged ({type(e).__name__}: {e})") from None
+
+    def _load(self, s: m.State) -> None:
         self.order, self._offset, self._log, self._now = s["order"], s["offset"], s["log"], s["now"]
         self.rotate_due = s["rotate_due"]
         self.wall.load(s["wall"])
@@ -391,16 +450,19 @@ class Pipeline:
             r.frame = None if state["frame"] is None else Frame(tuple(state["frame"]), r.azimuth_deg)
             r.reference = None if state["reference"] is None else tuple(state["reference"])
             r.provisional = state["provisional"]
+            if r.heading is not None:
+                r.heading.load(state["heading"])
         for k, a in self.accelerometers.items():
             a.codec.load(s["accelerometers"][k]["codec"])
             a.clock.load(s["accelerometers"][k]["clock"])
         self.station.load(s["station"])
+        self.triggers.load(s["triggers"])
 
     def slow(self) -> bytes:
         """What outlives a run: references, latencies, noise and bias. Kept in the state directory."""
         return pack(
             {
-                "version": STATE_VERSION,
+                "version": SLOW_VERSION,
                 "axes": self.config.structure.azimuth_deg,
                 "receivers": {
                     k: {
@@ -420,8 +482,8 @@ class Pipeline:
         win over what was learned.
         """
         s = unpack(data)
-        if not isinstance(s, dict) or s.get("version") != STATE_VERSION:
-            raise ValueError(f"kept state: version {STATE_VERSION} expected")
+        if not isinstance(s, dict) or s.get("version") != SLOW_VERSION:
+            raise ValueError(f"kept state: version {SLOW_VERSION} expected")
         try:
             self._adopt(s)
         except (AttributeError, IndexError, KeyError, TypeError) as e:
@@ -460,4 +522,5 @@ def fingerprint(config: m.Config) -> str:
     """Hash of every setting that the derived bytes depend on; not of paths, retention or the site's name."""
     parts: list[Any] = [config.structure, config.fusion, config.record.view_hz, config.record.accel_block]
     parts += [list(x.items()) for x in (config.receivers, config.accelerometers, config.points)]  # their order counts
+    parts += [list(config.triggers.items()), config.events.hold_s, config.events.release]
     return hashlib.sha256(repr(parts).encode()).hexdigest()

@@ -1,377 +1,73 @@
-"""Threads, bounded queues, supervision, shutdown: what turns the pipeline into a service.
+"""Threads, supervision, shutdown: what turns the pipeline into a service.
 
     one reader per port --inbox--> main: Pipeline.step, encode --outbox--> writer: Recorder
+                                     `--Status, once a second--> publisher: status.json, edge-agent.prom
 
-Readers never block on a full inbox: the newest block is dropped and counted. Main refuses derived records above 75 % of
-the outbox and raw ones only when it is full, before they are stepped, so what is recorded is what was stepped. Every
-loss is written down as a LOSS on `/faults` as soon as there is room. The writer holds records in a bounded ring while
-the disk refuses, and asks main for a fresh segment. A device that is lost is reopened with capped back-off; any other
-exception ends the process (its supervisor restarts it). All buffers and their bounds stand in `RecordSettings`.
+Readers (`reading.py`) never block on a full inbox: the newest block is dropped and counted. Main refuses derived
+records above 75 % of the outbox and raw ones when it is full, before they are stepped, so what is recorded is what was
+stepped; Ticks and its own records have a reserve. Every loss is written down as a LOSS on `/faults` as soon as there is
+room, and once a second the ledger of each port must balance:
+
+    received = written + queued + dropped(inbox) + refused(outbox) + lost(disk)
+
+where `queued` is counted one by one where blocks wait; what is missing is a fault LEDGER. The writer (`writing.py`)
+holds records in a bounded ring while the disk refuses, and asks main for a fresh segment; when it does not come back
+from the disk for 5 s, that is a fault WRITER_STALLED. What the agent says of itself is gathered in `observe.py`. Any
+exception that is not a port's or the disk's ends the process (its supervisor restarts it). All buffers and their bounds
+stand in `RecordSettings`.
 """
 
 from __future__ import annotations
 
 import os
 import platform
-import shutil
 import signal
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
-from typing import Protocol
 
 import numpy as np
 
 import drivers
 from edge_agent import assemble, lock
 from edge_agent import messages as m
+from edge_agent import status as st
 from edge_agent.notify import Notifier
+from edge_agent.observe import Observer, Publisher, resident_bytes
 from edge_agent.pipeline import Pipeline
 from edge_agent.queues import ByteQueue
+from edge_agent.reading import (
+    HUNG_MOST,
+    HUNG_S,
+    RECORD_OVERHEAD,
+    Account,
+    Arrival,
+    Payload,
+    Port,
+    PortWatch,
+    Reader,
+    payload_size,
+)
 from edge_agent.recording import topics
-from edge_agent.recording.segments import Recorder, RecordingError, recover
+from edge_agent.recording.clips import FOLDER as CLIPS_FOLDER
+from edge_agent.recording.clips import Clips
+from edge_agent.recording.segments import Recorder, recover
+from edge_agent.writing import DERIVED_SHARE, MB, Beat, Keep, Writer, free_bytes, note_loss
 
-MB = 1_000_000
-DERIVED_SHARE = 0.75  # of the outbox: derived records can be recomputed from raw ones, so they go first
-BACKOFF_S = (1.0, 60.0)  # first and longest wait before a port is opened again
-RETRY_NS = 5 * m.S  # a refusing disk is tried again after so long
+STALLED_S = 5.0  # the writer is at one operation so long
 STATE_FILE = "state/kept.bin"
-RECORD_OVERHEAD = 120  # bytes that a record costs in a queue beside its data
+CLIPS_S = 10.0  # at a stop, what clips may still take
+RESERVE_BYTES = MB  # of the outbox beyond its bound, for Ticks and for what tells of the loss
 HEAD_RECORDS = 64  # Ticks, faults and diagnostics that wait for the first data; then the first file begins without
 
 INFO, WARNING, ERROR = 20, 30, 40
-Payload = bytes | m.CanFrames | m.Tick
-
-
-class Port(Protocol):
-    counters: dict[str, int]
-
-    def open(self) -> None: ...
-    def read(self) -> list[tuple[int, Payload]]: ...
-    def close(self) -> None: ...
-
-
-@dataclass(frozen=True, slots=True)
-class Arrival:
-    """What a reader puts into the inbox: a block that was read, or a fault of its port."""
-
-    t_ns: int
-    source: str
-    payload: Payload | m.Fault
-
-
-@dataclass(frozen=True, slots=True)
-class Keep:
-    """Order to the writer: put the slow state into the state directory."""
-
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Beat:
-    """A Tick has come through the inbox and main: once the writer has it too, the supervisor is told."""
-
-    lines: tuple[str, ...]
-
-
-class Account:
-    """Ledger of one port: received = written + queued + dropped + refused + lost; one thread writes each counter."""
-
-    def __init__(self) -> None:
-        self.received = 0  # reader
-        self.dropped = 0  # reader: inbox full
-        self.refused = 0  # main: outbox full
-        self.written = 0  # writer
-        self.lost = 0  # writer: the disk refused
-        self.bytes = 0  # reader
-
-
-class Reader(threading.Thread):
-    """Reads one port for ever; opens it again when the device is lost."""
-
-    def __init__(self, name: str, port: Port, inbox: ByteQueue[Arrival], account: Account, stop: threading.Event):
-        super().__init__(name=f"read-{name}", daemon=True)
-        self.source, self.port, self.inbox, self.account, self.stopping = name, port, inbox, account, stop
-        self.failure: BaseException | None = None
-
-    def run(self) -> None:
-        try:
-            self._run()
-        except BaseException as e:  # noqa: BLE001 - main raises it and ends the process
-            self._fault("CRASH", f"{type(e).__name__}: {e}")
-            self.failure = e
-
-    def _run(self) -> None:
-        wait = BACKOFF_S[0]
-        lost = False
-        while not self.stopping.is_set():
-            try:
-                self.port.open()
-                if lost:
-                    self._fault("PORT_OPEN", "open again")
-                while not self.stopping.is_set():
-                    for t_ns, payload in self.port.read():
-                        self._offer(t_ns, payload)
-                        wait = BACKOFF_S[0]
-            except drivers.PortError as e:
-                self.port.close()
-                self._fault("PORT_LOST", f"{e}; next try in {wait:.0f} s", (("retry_s", wait),))
-                lost = True
-                self.stopping.wait(wait)
-                wait = min(2 * wait, BACKOFF_S[1])
-        self.port.close()
-
-    def _offer(self, t_ns: int, payload: Payload) -> None:
-        size = payload_size(payload)
-        self.account.received += 1
-        self.account.bytes += size
-        if not self.inbox.put(Arrival(t_ns, self.source, payload), size + RECORD_OVERHEAD):
-            self.account.dropped += 1
-
-    def _fault(self, kind: str, text: str, values: tuple[tuple[str, float], ...] = ()) -> None:
-        t_ns = time.monotonic_ns()
-        self.inbox.put(Arrival(t_ns, self.source, m.Fault(t_ns, self.source, kind, text, values)), 0, float("inf"))
-
-
-def payload_size(payload: Payload) -> int:
-    """Bytes that a payload holds in memory, near enough for a bound."""
-    if isinstance(payload, bytes):
-        return len(payload)
-    if isinstance(payload, m.CanFrames):
-        return int(payload.t_ns.size) * (14 + int(payload.data.shape[1]))
-    return 32
-
-
-class Writer(threading.Thread):
-    """Drives the Recorder; holds records in a ring while the disk refuses."""
-
-    def __init__(
-        self,
-        outbox: ByteQueue[m.Record | m.Rotate | Keep | Beat],
-        recorder: Recorder,
-        settings: m.RecordSettings,
-        state_path: Path,
-        accounts: Mapping[str, Account],
-        notifier: Notifier,
-    ) -> None:
-        super().__init__(name="writer", daemon=True)
-        self.notifier = notifier
-        self.outbox, self.recorder, self.settings, self.state_path = outbox, recorder, settings, state_path
-        self.accounts = accounts
-        self.failure: BaseException | None = None
-        self.want_rotate = False  # read and cleared by main
-        self.holding = False  # no file is open, records wait in the ring; what main says of losses waits too
-        self.open_file = (0, 0)  # Rotates taken so far, bytes of the open file; one value, so that both are of one time
-        self.faults: deque[m.Fault] = deque()
-        self.lost: dict[str, list[int]] = {}  # topic -> [count, first log_time, last log_time]
-        self.lock = threading.Lock()
-        self._rotates = 0
-        self._ring: deque[m.Record | m.Rotate] = deque()  # empty, or begins with a Rotate
-        self._ring_bytes = 0
-        self._told = False  # of the disk's refusal
-        self._retry_ns = 0
-
-    def run(self) -> None:
-        try:
-            while not self.outbox.drained:
-                items = self.outbox.take(min(self.settings.flush_s, 1.0), self.outbox.limit_bytes // 4)
-                now = time.monotonic_ns()
-                for item in items:
-                    self._one(item, now)
-                self._due(now)
-            self._end(time.monotonic_ns())
-        except BaseException as e:  # noqa: BLE001 - main raises it and ends the process
-            self.failure = e
-
-    def _end(self, now: int) -> None:
-        if self.holding and self._ring:
-            self._resume(now)
-        for item in self._ring:
-            self._lose(item)
-        try:
-            self.recorder.close()
-        except RecordingError as e:
-            self._failed(e, now)
-
-    def _one(self, item: m.Record | m.Rotate | Keep | Beat, now: int) -> None:
-        if isinstance(item, Keep):
-            self._keep(item.data, now)
-            return
-        if isinstance(item, Beat):
-            self.notifier.send("WATCHDOG=1", *item.lines)
-            return
-        self._rotates += isinstance(item, m.Rotate)
-        if not self.holding:
-            self._write(item, now)
-            return
-        self._hold(item, now)
-        if isinstance(item, m.Rotate) and now >= self._retry_ns:
-            self._resume(now)
-
-    def _write(self, item: m.Record | m.Rotate, now: int) -> bool:
-        """Whether a file is open behind it."""
-        try:
-            self.recorder.handle(item, now)
-        except RecordingError as e:
-            self._failed(e, now, item)
-            return not self.holding
-        if isinstance(item, m.Record) and (account := self._account(item)):
-            account.written += 1
-        return True
-
-    def _account(self, record: m.Record) -> Account | None:
-        return self.accounts.get(record.topic[5:]) if record.topic.startswith("/raw/") else None
-
-    def _failed(self, e: RecordingError, now: int, item: m.Record | m.Rotate | None = None) -> None:
-        """The disk refused, at `item` or at a flush. Main must see `holding` and `want_rotate` before what they hold
-        back, or a LOSS or a fault would go where nothing is written."""
-        self.holding = self.recorder.path is None
-        waits = self.holding and isinstance(item, m.Rotate)  # no file could be begun: the order stands
-        if self.holding and not waits:
-            self.want_rotate = True
-        for record in e.unwritten:
-            if waits and isinstance(item, m.Rotate) and record is item.checkpoint:
-                continue
-            if record is not item and (account := self._account(record)):
-                account.written -= 1
-            self._lose(record)
-        if waits and item is not None:
-            self._hold(item, now)
-        if not (self.holding and self._told):
-            text = f"{e}; records wait in memory until the disk takes them" if self.holding else str(e)
-            self.faults.append(m.Fault(now, "recorder", "DISK_" + e.reason.upper(), text))
-        self._told = self.holding
-        self._retry_ns = now + RETRY_NS
-
-    def _hold(self, item: m.Record | m.Rotate, now: int) -> None:
-        """Keep for later what follows a Rotate; over the bound the oldest segment is lost, and counted."""
-        bound = self.settings.ring_mb * MB
-        size = held_size(item)
-        if isinstance(item, m.Record) and item.derived and self._ring_bytes + size > DERIVED_SHARE * bound:
-            self._lose(item)
-            return
-        if self._ring and self._ring_bytes + size > bound:
-            self._drop_oldest()
-            if not self._ring and isinstance(item, m.Record):
-                self.want_rotate = True  # a file can only begin at a checkpoint
-            self.faults.append(m.Fault(now, "recorder", "RING_FULL", "the disk still refuses; held records are lost"))
-        if self._ring or isinstance(item, m.Rotate):
-            self._ring.append(item)
-            self._ring_bytes += size
-        else:
-            self._lose(item)
-
-    def _drop_oldest(self) -> None:
-        """Lose the ring's first Rotate and what follows it up to the next."""
-        while self._ring:
-            item = self._ring.popleft()
-            self._ring_bytes -= held_size(item)
-            self._lose(item)
-            if self._ring and isinstance(self._ring[0], m.Rotate):
-                return
-
-    def _resume(self, now: int) -> None:
-        held, self._ring, self._ring_bytes = list(self._ring), deque(), 0
-        good = True
-        for item in held:
-            if good:
-                good = self._write(item, now)
-            else:  # refused again: behind a Rotate the rest waits on, else it is lost
-                self._hold(item, now)
-        if good:
-            self.holding = self._told = False
-            self.faults.append(m.Fault(now, "recorder", "DISK_OK", "recording goes on"))
-
-    def _due(self, now: int) -> None:
-        if self.holding:
-            if self._ring and now >= self._retry_ns:
-                self._resume(now)
-        else:
-            try:
-                self.recorder.idle(now)
-            except RecordingError as e:
-                self._failed(e, now)
-        self.open_file = self._rotates, self.recorder.open_bytes
-        self.faults.extend(self.recorder.drain_faults())
-
-    def _lose(self, item: m.Record | m.Rotate) -> None:
-        if isinstance(item, m.Rotate):
-            return
-        if account := self._account(item):
-            account.lost += 1
-        with self.lock:
-            note_loss(self.lost, item)
-
-    def _keep(self, data: bytes, now: int) -> None:
-        try:
-            self.state_path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = self.state_path.with_suffix(".new")
-            with open(temporary, "wb") as f:
-                f.write(data)
-                f.flush()
-                os.fsync(f.fileno())
-            os.replace(temporary, self.state_path)
-        except OSError as e:
-            self.faults.append(m.Fault(now, "state", "STATE_NOT_KEPT", f"{self.state_path}: {e.strerror or e}"))
-
-
-def held_size(item: m.Record | m.Rotate) -> int:
-    """Bytes that an item costs while it is held."""
-    return len(item.checkpoint.data if isinstance(item, m.Rotate) else item.data) + RECORD_OVERHEAD
-
-
-def note_loss(lost: dict[str, list[int]], record: m.Record) -> None:
-    """Add a lost record to the account by topic: count, first and last log_time."""
-    entry = lost.setdefault(record.topic, [0, record.log_ns, record.log_ns])
-    entry[0] += 1
-    entry[1], entry[2] = min(entry[1], record.log_ns), max(entry[2], record.log_ns)
-
-
-class PortWatch:
-    """Says when a port falls silent, sends garbage, or never says a position; once per change of state."""
-
-    SILENT_S = 5.0
-    POSITION_S = 10.0
-
-    def __init__(self, kind: str) -> None:
-        self.kind = kind
-        self.state = "START"
-        self._seen: dict[str, int] = {}
-        self._since: dict[str, int] = {}
-
-    def look(self, t_ns: int, counts: Mapping[str, int]) -> tuple[str, str] | None:
-        """counts: bytes (or frames), good (sentences or samples), positions, all cumulative. Return (state, text)."""
-        for key, value in counts.items():
-            if self._seen.get(key) != value or key not in self._since:
-                self._since[key] = t_ns
-            self._seen[key] = value
-        age = {k: (t_ns - t) / m.S for k, t in self._since.items()}
-        unit, good = ("bytes", "sentence") if self.kind == "serial" else ("frames", "sample")
-        if age["bytes"] > self.SILENT_S:
-            state, text = "SILENT", f"nothing has come for {age['bytes']:.0f} s: check power, cable and device"
-            self._since["good"] = self._since["positions"] = t_ns  # what comes next gets its time to be understood
-        elif age["good"] > self.SILENT_S:
-            hint = "baud rate and protocol" if self.kind == "serial" else "bit rate, ids and DBC file"
-            state = "GARBAGE" if self.kind == "serial" else "NO_MATCH"
-            text = f"{unit} come, but no good {good} for {age['good']:.0f} s: check {hint}"
-        elif self.kind == "serial" and age["positions"] > self.POSITION_S:
-            state = "NO_POSITION"
-            text = f"good sentences come, but no position for {age['positions']:.0f} s: switch on GGA (and GST)"
-        elif not self._seen["good"] or (self.state == "SILENT" and age["good"] > 0):
-            return None  # not yet known
-        else:
-            state, text = "OK", f"good {good}s come"
-        if state == self.state:
-            return None
-        first, self.state = self.state == "START", state
-        return None if first and state == "OK" else (state, text)
+GOOD_NEWS = ("PORT_OPEN", "OK", "DISK_OK", "WRITER_OK", "STATUS_OK", "CLIP")
 
 
 class Agent:
@@ -385,8 +81,14 @@ class Agent:
         recorder: Recorder,
         say: Callable[[str], None],
         notifier: Notifier | None = None,
+        status_dir: Path | None = None,
+        make_port: Callable[[str], Port] | None = None,
+        now: Callable[[], int] = time.monotonic_ns,
     ) -> None:
+        """`status_dir` = where the status goes, None = nowhere; `make_port` makes the port of a reader that takes over
+        from one that hangs; `now` = monotonic ns, for what is said to hang."""
         self.config, self.pipeline, self.recorder, self._print = config, pipeline, recorder, say
+        self._make_port, self._now = make_port, now
         self.stop = threading.Event()
         record = config.record
         self.inbox: ByteQueue[Arrival] = ByteQueue(int(record.inbox_mb * MB))
@@ -394,10 +96,19 @@ class Agent:
         self.accounts = {name: Account() for name in ports}
         state_path = Path(config.data_dir) / STATE_FILE
         self.notifier = notifier or Notifier(None)
-        self.writer = Writer(self.outbox, recorder, record, state_path, self.accounts, self.notifier)
+        self.writer = Writer(self.outbox, recorder, record, state_path, self.accounts, self.notifier, now)
+        self.observer = Observer(config, pipeline)
+        self.clips = Clips(recorder, config.events, config.triggers.values()) if config.triggers else None
+        self.publisher = None if status_dir is None else Publisher(status_dir)
         self._beats = 0
+        self._last_tick: tuple[int, int] | None = None  # monotonic, UTC
         self._synced = True  # only what differs is said
-        self.readers = {n: Reader(n, p, self.inbox, self.accounts[n], self.stop) for n, p in ports.items()}
+        self.readers = {n: Reader(n, p, self.inbox, self.accounts[n], self.stop, now) for n, p in ports.items()}
+        self._abandoned: list[Reader] = []
+        self._stalled_s = 0.0  # the writer has been at one operation so long
+        self._stalls = 0
+        self._unaccounted: dict[str, int] = {}  # port or codec -> what its ledger cannot account for, as told
+        self._status_failed = False  # as told
         self._head: list[m.Record] = []  # what came before the first file
         self._open = False
         self._rotates = 0
@@ -407,6 +118,7 @@ class Agent:
         self._kernel: dict[str, int] = {}
         self._watch = {n: PortWatch(config.ports[n].kind) for n in ports if n in config.ports and self._listeners(n)}
         self._stamp = 0  # log_time of what the runtime itself records
+        self._tick_ns = 0  # the last second
 
     def _listeners(self, port: str) -> list[str]:
         c = self.config
@@ -419,11 +131,28 @@ class Agent:
         `found` = faults from before the start, recorded as soon as the time is known.
         """
         self.writer.start()
+        if self.clips is not None:
+            self.clips.start()
+        if self.publisher is not None:
+            self.publisher.start()
+        state = "failed"
         try:
             self._run(found)
+            state = "stopped"
+        except BaseException as e:
+            self.say(ERROR, f"failed: {type(e).__name__}: {e}")
+            raise
         finally:
             self.outbox.close()
             self.writer.join()
+            if self.clips is not None:
+                self.clips.close(time.monotonic_ns())
+                self.clips.join(CLIPS_S)
+                self.writer.faults.extend(self.clips.faults)
+            if self.publisher is not None:
+                if self._last_tick is not None:
+                    self.publisher.offer(self._status(*self._last_tick, state))
+                self.publisher.close()
             for f in self.writer.faults:
                 self._print(f"{f.source}: {f.kind}: {f.text}")
             for topic, (count, _, _) in self.writer.lost.items():
@@ -433,10 +162,8 @@ class Agent:
         return 0
 
     def _run(self, found: Sequence[m.Fault]) -> None:
-        clock = self.readers.pop("clock")
-        clock.start()
+        self.readers["clock"].start()
         started = False
-        everyone = [clock, *self.readers.values()]
         while True:
             for arrival in self.inbox.take(0.5):
                 self._arrived(arrival)
@@ -446,13 +173,13 @@ class Agent:
                     self.say(INFO, f"edge-agent {version('edge-agent')} at {self.config.site}: {ports}")
                     for fault in found:
                         self.fault(fault)
-                    for reader in self.readers.values():
-                        reader.start()
-            self._failures(everyone)
+                    for name in self.config.ports:
+                        self.readers[name].start()
+            self._failures()
             if self.stop.is_set():
                 break
         self.notifier.send("STOPPING=1")
-        for reader in everyone:
+        for reader in self.readers.values():
             if reader.ident is not None:
                 reader.join(timeout=5.0)
         for arrival in self.inbox.take(0.0):
@@ -462,10 +189,11 @@ class Agent:
         self._tell_losses()
         self._put(Keep(self.pipeline.slow()))
         self.say(INFO, "stopped")
-        self._failures(everyone)
+        self._failures()
 
-    def _failures(self, readers: list[Reader]) -> None:
-        for failure in (*(r.failure for r in readers), self.writer.failure):
+    def _failures(self) -> None:
+        threads = (*self.readers.values(), self.writer, self.publisher, self.clips)
+        for failure in [t.failure for t in threads if t is not None]:
             if failure is not None:
                 for arrival in self.inbox.take(0.0):  # the fault that tells of it among them
                     self._arrived(arrival)
@@ -474,17 +202,24 @@ class Agent:
     # ----------------------------------------------------------------------------------------------------- each block
 
     def _arrived(self, arrival: Arrival) -> None:
-        if isinstance(arrival.payload, m.Fault):
-            self.fault(arrival.payload)
+        payload = arrival.payload
+        if isinstance(payload, m.Fault):
+            self.fault(payload)
             return
-        tick = isinstance(arrival.payload, m.Tick)
-        if not tick and self.outbox.bytes + payload_size(arrival.payload) > self.outbox.limit_bytes:
+        tick = isinstance(payload, m.Tick)
+        room = self.outbox.limit_bytes + (RESERVE_BYTES if tick else 0)
+        if self.outbox.bytes + payload_size(payload) > room:
             self.accounts[arrival.source].refused += 1
             now = self.pipeline.to_utc(arrival.t_ns)
             note_loss(self._lost, m.Record(f"/raw/{arrival.source}", now, now, b"", False))
-            return
+        else:
+            self._step(arrival, payload, tick)
+        if isinstance(payload, m.Tick):
+            self._every_second(arrival.t_ns, payload.utc_ns)
+
+    def _step(self, arrival: Arrival, payload: Payload, tick: bool) -> None:
         self._rotate_if_due(arrival.t_ns, tick)
-        raw = m.Raw(arrival.t_ns, self.pipeline.order, arrival.source, arrival.payload)
+        raw = m.Raw(arrival.t_ns, self.pipeline.order, arrival.source, payload)
         try:
             records = self.pipeline.step(raw)
         except BaseException:  # this program is wrong: the block that shows it must be in the recording
@@ -492,11 +227,11 @@ class Agent:
             raise
         for record in records:
             self._put(record)
-        if isinstance(arrival.payload, m.CanFrames) and arrival.payload.dropped:
-            self._kernel[arrival.source] = self._kernel.get(arrival.source, 0) + arrival.payload.dropped
-            self._loss("kernel", arrival.source, arrival.payload.dropped, arrival.t_ns, arrival.t_ns)
-        if tick:
-            self._every_second(arrival.t_ns)
+            if record.topic == "/events" and self.clips is not None:
+                self.clips.saw(record, self.pipeline.to_utc(0))
+        if isinstance(payload, m.CanFrames) and payload.dropped:
+            self._kernel[arrival.source] = self._kernel.get(arrival.source, 0) + payload.dropped
+            self._loss("kernel", arrival.source, payload.dropped, arrival.t_ns, arrival.t_ns)
 
     def _rotate_if_due(self, t_ns: int, tick: bool) -> None:
         record = self.config.record
@@ -506,9 +241,8 @@ class Agent:
             if tick and len(self._head) < HEAD_RECORDS:
                 return  # no file before there is data
             self._rotate("start", t_ns)
-            head, self._head = self._head, []
-            for held in head:
-                self._put(held)
+        elif self.outbox.bytes > DERIVED_SHARE * self.outbox.limit_bytes:
+            return  # a checkpoint is large, and the writer is behind: all of these can wait
         elif self.pipeline.rotate_due:
             self._rotate(self.pipeline.rotate_due, t_ns)
         elif self.writer.want_rotate:
@@ -531,7 +265,13 @@ class Agent:
         # by the map before too: one that moves back a little must not cross the same border again
         self._period = max(utc, rotate.utc_ns) // (self.config.record.rotate_s * m.S)
         self._stamp = rotate.utc_ns
+        head, self._head = sorted(self._head, key=lambda r: r.log_ns), []
+        if head:  # the first file: log times must not step back behind the checkpoint
+            first = min(head[0].log_ns, rotate.checkpoint.log_ns)
+            rotate = replace(rotate, checkpoint=replace(rotate.checkpoint, log_ns=first, publish_ns=first))
         self.outbox.put(rotate, len(rotate.checkpoint.data), float("inf"))
+        for held in head:
+            self._put(held)
         self._transforms()
         self._put(Keep(self.pipeline.slow()))
 
@@ -552,8 +292,10 @@ class Agent:
             if not item.derived:
                 self._head.append(item)
             return
-        share = DERIVED_SHARE if item.derived else float("inf")  # raw was weighed before it was stepped
-        if not self.outbox.put(item, len(item.data) + RECORD_OVERHEAD, share):
+        source = item.topic[5:] if item.topic.startswith("/raw/") else ""  # was weighed before it was stepped
+        own = 1.0 + RESERVE_BYTES / self.outbox.limit_bytes
+        share = float("inf") if source else DERIVED_SHARE if item.derived else own
+        if not self.outbox.put(item, len(item.data) + RECORD_OVERHEAD, share, source):
             note_loss(self._lost, item)
 
     # ------------------------------------------------------------------------------------------- the runtime's records
@@ -569,7 +311,10 @@ class Agent:
         """Say a fault on stderr and record it."""
         stamp = self._stamped(min(f.t_ns, time.monotonic_ns()))
         self._own("/faults", topics.event(f.kind, f.source, f.text, f.values, f.t_ns, stamp))
-        self.say(WARNING if f.kind not in ("PORT_OPEN", "OK", "DISK_OK") else INFO, f"{f.source}: {f.kind}: {f.text}")
+        self.say(INFO if f.kind in GOOD_NEWS else WARNING, f"{f.source}: {f.kind}: {f.text}")
+        self.observer.fault(f)
+        if self.clips is not None:
+            self.clips.fault(f.kind, f.t_ns)
 
     def say(self, level: int, text: str) -> None:
         """One line on stderr and on /rosout."""
@@ -581,6 +326,9 @@ class Agent:
         stamp = self._stamped(end_ns)
         to_utc = self.pipeline.to_utc
         text = f"{count} lost at {where}"
+        self.observer.loss(where, source, count, self._tick_ns)
+        if self.clips is not None:
+            self.clips.fault("LOSS", end_ns)
         self._print(f"{source}: LOSS: {text}")
         values = (("count", float(count)),)
         self._own(
@@ -604,10 +352,17 @@ class Agent:
                 now = time.monotonic_ns()
                 self._loss("inbox", name, new, now - m.S, now)
 
-    def _every_second(self, t_ns: int) -> None:
+    # ----------------------------------------------------------------------------------------------------- each second
+
+    def _every_second(self, t_ns: int, utc_ns: int) -> None:
+        self._tick_ns = t_ns
         self._stamped(t_ns)
         while self.writer.faults and not self.writer.want_rotate:
             self.fault(self.writer.faults.popleft())
+        if self.clips is not None:
+            self.clips.every_second(t_ns)
+            while self.clips.faults:
+                self.fault(self.clips.faults.popleft())
         if self.outbox.bytes < DERIVED_SHARE * self.outbox.limit_bytes:
             self._tell_losses()
         if self.pipeline.wall.sync != self._synced:
@@ -615,6 +370,20 @@ class Agent:
             words = "is disciplined" if self._synced else "is NOT disciplined: fixes rest on a latency set or assumed"
             self.say(INFO if self._synced else WARNING, f"clock: the host's clock {words}")
         counters = self.pipeline.counters()
+        self._watch_ports(t_ns, counters)
+        self._watch_writer(t_ns)
+        self._watch_status(t_ns)
+        pages = self._pages()
+        self._watch_ledgers(t_ns, pages, counters)
+        self._own("/diagnostics", topics.diagnostics(self._statuses(pages, counters), self._stamp))
+        states = ", ".join(f"{port} {watch.state}" for port, watch in self._watch.items())
+        self._beats += 1  # at the second one, every port has been tried
+        self._put(Beat((*(("READY=1",) if self._beats == 2 else ()), f"STATUS={states or 'no sensors'}")))
+        self._last_tick = t_ns, utc_ns
+        if self.publisher is not None:
+            self.publisher.offer(self._status(t_ns, utc_ns, "running", pages))
+
+    def _watch_ports(self, t_ns: int, counters: Mapping[str, Mapping[str, int]]) -> None:
         for port, watch in self._watch.items():
             names = self._listeners(port)
             good = "accepted" if watch.kind == "serial" else "samples"
@@ -622,42 +391,120 @@ class Agent:
                 "bytes": self.accounts[port].bytes,
                 "good": sum(counters[n].get(good, 0) for n in names),
                 "positions": sum(counters[n].get("positions", 0) for n in names),
+                "bus_off": self.readers[port].port.counters.get("error_bus_off", 0),
             }
             told = watch.look(t_ns, counts)
             if told:
                 self.fault(m.Fault(t_ns, port, told[0], told[1]))
-        self._own("/diagnostics", topics.diagnostics(self._statuses(counters), self._stamp))
-        states = ", ".join(f"{port} {watch.state}" for port, watch in self._watch.items())
-        self._beats += 1  # at the second one, every port has been tried
-        self._put(Beat((*(("READY=1",) if self._beats == 2 else ()), f"STATUS={states or 'no sensors'}")))
+            reader = self.readers[port]
+            if reader.busy_ns and self._now() - reader.busy_ns > HUNG_S * m.S:
+                self._take_over(port, reader, t_ns)
+            elif (next_s := watch.reopen_due(t_ns)) and reader.state == "OPEN":
+                if watch.reopens == 1:  # told once per silence
+                    text = f"still silent: opened again, and again after {next_s:.0f} s and more"
+                    self.fault(m.Fault(t_ns, port, "PORT_REOPEN", text))
+                reader.reopen.set()
 
-    def _statuses(self, counters: Mapping[str, Mapping[str, int]]) -> list[topics.Status]:
+    def _take_over(self, port: str, reader: Reader, t_ns: int) -> None:
+        """A driver does not come back: a fresh reader tries with a port of its own."""
+        self._abandoned = [r for r in self._abandoned if r.is_alive()]
+        if self._make_port is None or sum(r.source == port for r in self._abandoned) >= HUNG_MOST:
+            return
+        text = f"its driver has been in one call for {HUNG_S:.0f} s; another reader takes over"
+        self.fault(m.Fault(t_ns, port, "PORT_HUNG", text))
+        reader.abandoned = True
+        self._abandoned.append(reader)
+        fresh = Reader(port, self._make_port(port), self.inbox, self.accounts[port], self.stop, self._now)
+        fresh.state = "LOST"  # until it is open
+        self.readers[port] = fresh
+        fresh.start()
+
+    def _watch_writer(self, t_ns: int) -> None:
+        busy = self.writer.busy_ns
+        seconds = (self._now() - busy) / m.S if busy else 0.0
+        if seconds > STALLED_S:
+            if not self._stalled_s:
+                self._stalls += 1
+                text = f"the disk has not answered for {seconds:.0f} s; records wait in memory"
+                self.fault(m.Fault(t_ns, "recorder", "WRITER_STALLED", text, (("stalled_s", seconds),)))
+            self._stalled_s = seconds
+        elif self._stalled_s:
+            text = f"the disk answers again, after {self._stalled_s:.0f} s and more"
+            self.fault(m.Fault(t_ns, "recorder", "WRITER_OK", text, (("stalled_s", self._stalled_s),)))
+            self._stalled_s = 0.0
+
+    def _watch_status(self, t_ns: int) -> None:
+        """A status that cannot be written is told once, and once when it can again."""
+        if self.publisher is None or bool(self.publisher.error) == self._status_failed:
+            return
+        self._status_failed = not self._status_failed
+        if self._status_failed:
+            text = f"{self.publisher.error}; the agent goes on"
+            self.fault(m.Fault(t_ns, "status", "STATUS_NOT_WRITTEN", text))
+        else:
+            self.fault(m.Fault(t_ns, "status", "STATUS_OK", f"written again, {self.publisher.failed} could not be"))
+
+    # ---------------------------------------------------------------------------------------------------------- ledger
+
+    def _pages(self) -> dict[str, Page]:
+        """The ledger of each port now. Readers and writer go on meanwhile: each part is taken at a moment when it
+        agrees in itself, and what the writer took since it last closed its books is in its hand."""
+        books = self.writer.books
+        outbox, taken = self.outbox.account()
+        found = {}
+        for name, account in self.accounts.items():
+            with account.lock:
+                received, dropped, size = account.received, account.dropped, account.bytes
+                inbox = self.inbox.account()[0][name]
+            head = sum(r.topic == f"/raw/{name}" for r in self._head)
+            page = books[name]
+            queued = inbox + head + outbox[name] + (taken[name] - page.taken) + page.ring
+            found[name] = Page(received, page.written, queued, dropped, account.refused, page.lost, size)
+        return found
+
+    def _watch_ledgers(self, t_ns: int, pages: Mapping[str, Page], counters: Mapping[str, Mapping[str, int]]) -> None:
+        for name, page in pages.items():
+            said = ", ".join(f"{k} {v}" for k, v in page.figures().items())
+            self._balance(t_ns, name, page.unaccounted, f"blocks are unaccounted for: {said}")
+        for name, c in counters.items():
+            rejects = sum(self.observer.rejects[name].values())
+            self._balance(t_ns, name, c["rejected"] - rejects, f"of {c['rejected']} rejects came without a reason")
+            if name in self.config.accelerometers:
+                whole, parts = "frames", {k: c[k] for k in ("accepted", "duplicates", "rejected", "pending")}
+            else:
+                whole, parts = "bytes", {k: c[k] for k in ("sentence_bytes", "binary_bytes", "skipped_bytes")}
+                parts["waiting"] = self.pipeline.receivers[name].codec.waiting
+            said = ", ".join(f"{k} {v}" for k, v in parts.items())
+            text = f"{whole} of {c[whole]} are unaccounted for: {said}"
+            self._balance(t_ns, f"{name} {whole}", c[whole] - sum(parts.values()), text)
+
+    def _balance(self, t_ns: int, name: str, missing: int, text: str) -> None:
+        """A ledger that does not balance is a bug: told whenever the difference changes."""
+        if missing == self._unaccounted.get(name, 0):
+            return
+        self._unaccounted[name] = missing
+        self.fault(m.Fault(t_ns, name, "LEDGER", f"{missing} {text}", (("missing", float(missing)),)))
+
+    # ---------------------------------------------------------------------------------------------------------- status
+
+    def _statuses(self, pages: Mapping[str, Page], counters: Mapping[str, Mapping[str, int]]) -> list[topics.Status]:
         status = topics.Status
         found = []
-        for name, a in self.accounts.items():
-            queued = a.received - a.written - a.dropped - a.refused - a.lost
-            ledger = {
-                "received": a.received,
-                "written": a.written,
-                "queued": queued,
-                "dropped_inbox": a.dropped,
-                "refused_outbox": a.refused,
-                "lost_disk": a.lost,
-                "dropped_kernel": self._kernel.get(name, 0),
-                "bytes": a.bytes,
-            }
+        for name, page in pages.items():
+            ledger = {**page.figures(), "dropped_kernel": self._kernel.get(name, 0), "bytes": page.bytes}
             state = self._watch[name].state if name in self._watch else "OK"
-            level = 0 if state in ("OK", "START") and not (a.dropped or a.refused or a.lost) else 1
-            found.append(status(level, f"port/{name}", state, {k: str(v) for k, v in ledger.items()}))
+            good = state in ("OK", "START") and not (page.dropped or page.refused or page.lost or page.unaccounted)
+            found.append(status(0 if good else 1, f"port/{name}", state, {k: str(v) for k, v in ledger.items()}))
         for name, count in counters.items():
             found.append(status(0, f"codec/{name}", "", {k: str(v) for k, v in count.items()}))
-        free = free_bytes(Path(self.config.data_dir))
         wall = self.pipeline.wall
         values = {
             "inbox_bytes": str(self.inbox.bytes),
             "outbox_bytes": str(self.outbox.bytes),
             "file_bytes": str(self.writer.open_file[1]),
-            "disk_free_bytes": str(free),
+            "disk_free_bytes": str(self.writer.disk.free_bytes),
+            "writer_stalled_s": f"{self._stalled_s:.0f}",
+            "writer_stalls": str(self._stalls),
             "rss_bytes": str(resident_bytes()),
             "clock_sync": str(int(wall.sync)),
             "clock_error_ns": str(wall.error_ns),
@@ -665,23 +512,103 @@ class Agent:
         found.append(status(0 if wall.sync else 1, "agent", "" if wall.sync else "clock not disciplined", values))
         return found
 
+    def _status(self, t_ns: int, utc_ns: int, state: str, pages: Mapping[str, Page] | None = None) -> st.Status:
+        seen, writer, limit = self.writer.disk, self.writer, self.config.record.ring_mb * MB
+        recording = (
+            "closed"
+            if state != "running"
+            else "stalled"
+            if self._stalled_s
+            else "refused"
+            if writer.holding
+            else "recording"
+        )
+        disk = st.Disk(
+            os.path.abspath(self.config.data_dir),
+            recording if seen.file or recording != "recording" else "waiting",
+            seen.free_bytes,
+            seen.size_bytes,
+            seen.file,
+            writer.open_file[1],
+            (utc_ns - seen.begin_utc_ns) / m.S if seen.file else None,
+            seen.files,
+            seen.files_bytes,
+            seen.oldest_utc_ns,
+            self._stalled_s,
+            self._stalls,
+        )
+        queues = [
+            st.Queue("inbox", self.inbox.bytes, self.inbox.limit_bytes, len(self.inbox)),
+            st.Queue("outbox", self.outbox.bytes, self.outbox.limit_bytes, len(self.outbox)),
+            st.Queue("ring", writer.ring_bytes, int(limit), writer.ring_items),
+        ]
+        pages = pages or self._pages()
+        ports = [self._port_status(n, s, pages[n], t_ns) for n, s in self.config.ports.items()]
+        run = self.recorder.metadata.get("run", ""), version("edge-agent"), state
+        return self.observer.status(t_ns, utc_ns, run, ports, queues, disk)
 
-def free_bytes(path: Path) -> int:
-    """Free space of the file system that holds `path`, or its nearest parent that exists; -1 where it does not say."""
+    def _port_status(self, name: str, s: m.PortSettings, page: Page, t_ns: int) -> st.Port:
+        reader = self.readers[name]
+        state = reader.state
+        if reader.busy_ns and self._now() - reader.busy_ns > HUNG_S * m.S:
+            state = "HUNG"
+        elif state == "OPEN" and name in self._watch and self._watch[name].state != "START":
+            state = self._watch[name].state
+        age, flow = self.observer.port_flow(name, page.bytes, t_ns)
+        return st.Port(
+            name,
+            s.device or f"{s.interface} {s.channel}",
+            state,
+            self.observer.port_state(name, state, t_ns),
+            age,
+            page.bytes,
+            flow,
+            self.accounts[name].reopened,
+            page.received,
+            page.written,
+            page.queued,
+            page.dropped,
+            page.refused,
+            page.lost,
+            self._kernel.get(name, 0),
+            page.unaccounted,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """The ledger of one port, in blocks."""
+
+    received: int
+    written: int
+    queued: int
+    dropped: int
+    refused: int
+    lost: int
+    bytes: int
+
+    @property
+    def unaccounted(self) -> int:
+        return self.received - self.written - self.queued - self.dropped - self.refused - self.lost
+
+    def figures(self) -> dict[str, int]:
+        """By the names of `/diagnostics`."""
+        return {
+            "received": self.received,
+            "written": self.written,
+            "queued": self.queued,
+            "dropped_inbox": self.dropped,
+            "refused_outbox": self.refused,
+            "lost_disk": self.lost,
+        }
+
+
+def boot_id() -> str:
+    """The kernel's name for this boot, so that a kill and a power cut can be told apart later; "" where it has none."""
     try:
-        while not path.exists():
-            path = path.parent
-        return shutil.disk_usage(path).free
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
-        return -1
-
-
-def resident_bytes() -> int:
-    """Resident memory of this process; 0 where /proc does not say."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, IndexError, ValueError):
-        return 0
+        return ""
 
 
 def run_metadata(config: m.Config, run_id: str) -> dict[str, str]:
@@ -693,6 +620,7 @@ def run_metadata(config: m.Config, run_id: str) -> dict[str, str]:
         "python": platform.python_version(),
         "platform": assemble.platform_name(),
         "started_utc_ns": str(time.time_ns()),
+        "boot": boot_id(),
     }
 
 
@@ -708,7 +636,7 @@ def run(config: m.Config) -> int:
     found: list[m.Fault] = []
     try:
         lock.hold(data_dir)  # before anything there is touched
-        for r in recover(data_dir):
+        for r in (*recover(data_dir), *recover(data_dir / CLIPS_FOLDER)):
             text = f"{r.path.name}: {r.what}, {r.messages} messages kept {r.detail}".strip()
             found.append(m.Fault(now, "recorder", "RECOVERED", text))
     except OSError as e:  # the card may come back; until then records wait in memory
@@ -729,7 +657,16 @@ def run(config: m.Config) -> int:
     attachments = {"config.yaml": config.text.encode(), **dict(config.files)}
     metadata = run_metadata(config, os.urandom(8).hex())
     recorder = Recorder(data_dir, config.record, config.site, metadata, attachments, lambda: free_bytes(data_dir))
-    agent = Agent(config, pipeline, ports, recorder, say, Notifier(os.environ.get("NOTIFY_SOCKET")))
+    agent = Agent(
+        config,
+        pipeline,
+        ports,
+        recorder,
+        say,
+        Notifier(os.environ.get("NOTIFY_SOCKET")),
+        st.folder(os.environ, data_dir),
+        lambda name: make(drivers.PORTS, config.ports[name].kind)(config.ports[name]),
+    )
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         agent.stop.set()

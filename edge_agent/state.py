@@ -68,7 +68,7 @@ def unpack(data: bytes) -> Any:
         raise ValueError("checkpoint: cut short")
     try:
         skeleton = json.loads(data[12:base])
-    except ValueError as e:
+    except (ValueError, RecursionError) as e:
         raise ValueError(f"checkpoint: damaged skeleton: {e}") from None
 
     def take(offset: Any, length: int) -> bytes:
@@ -96,7 +96,10 @@ def unpack(data: bytes) -> Any:
             return {k: walk(v) for k, v in x.items()}
         return x
 
-    return walk(skeleton)
+    try:
+        return walk(skeleton)
+    except RecursionError:
+        raise ValueError("checkpoint: damaged skeleton: nested too deeply") from None
 
 
 def _triple(x: Any) -> tuple[str, list[int], Any]:

@@ -128,6 +128,14 @@ class FixClock:
         uncertain = not known or abs(target - self._map) > self.CONVERGED_NS
         return fix.utc_ns + self._map, uncertain, step
 
+    def time_of(self, utc_ns: int, arrival_ns: int) -> int:
+        """t_ns of a sentence that is no fix; teaches the clock nothing."""
+        if utc_ns and self._map is not None:
+            t_ns = utc_ns + self._map
+            if self.LATENCY_RANGE_NS[0] <= arrival_ns - t_ns <= self.LATENCY_RANGE_NS[1]:
+                return t_ns
+        return arrival_ns - self.latency_ns()
+
     def save(self) -> State:
         return {
             "learned": self.learned_ns,
@@ -173,6 +181,13 @@ class DeviceClock:
         self._last_t = -1
         self._last_c = 0
 
+    @property
+    def rate_error(self) -> float | None:
+        """The device's rate against the nominal one, less 1; None until arrivals of 30 s have told it."""
+        if self.nominal_ns is None or not self._bin_t or self._bin_t[-1] - self._bin_t[0] < 3 * self.BIN_NS:
+            return None
+        return self.nominal_ns / self.period_ns - 1.0
+
     def times(self, block: AccelBlock) -> tuple[I64, bool]:
         """Return (t_ns (n,), gap) for the next block; gap = samples were found missing before its first."""
         a = block.t_ns
@@ -183,7 +198,7 @@ class DeviceClock:
             return self._increasing(a), False
         p = self._t0 + np.rint((c - self._c0) * self.period_ns).astype(np.int64)
         e = a - p
-        k = int(np.argmin(e))
+        k = int(e.argmin())
         early = float(e[k])
         if abs(early) > self.RESET_NS:  # the device restarted, or the host slept: a new line
             self._bin_c, self._bin_t, self._late, self._span, self._fill = [], [], [], 1, 0
@@ -201,7 +216,7 @@ class DeviceClock:
             c = c + lost
             gap = True
             p = self._t0 + np.rint((c - self._c0) * self.period_ns).astype(np.int64)
-            k = int(np.argmin(a - p))
+            k = int((a - p).argmin())
         self._put(int(c[k]), int(a[k]))
         move = self._refit(int(c[-1]))
         # spread over the block, so that no single step between samples takes the whole correction
@@ -249,21 +264,23 @@ class DeviceClock:
         n = len(self._bin_c)
         if n < 2:
             return 0.0
-        c = np.array(self._bin_c, dtype=np.int64)
-        t = np.array(self._bin_t, dtype=np.int64)
-        x = (c - c[-1]).astype(np.float64)
-        y = (t - t[-1]).astype(np.float64)
-        mx, my = x.sum() / n, y.sum() / n
-        sxx = ((x - mx) ** 2).sum()
-        period = float(((x - mx) * (y - my)).sum() / sxx) if sxx > 0 else self.period_ns
+        c_last, t_last = self._bin_c[-1], self._bin_t[-1]
+        x = (np.array(self._bin_c) - c_last).astype(np.float64)
+        y = (np.array(self._bin_t) - t_last).astype(np.float64)
+        mx, my = float(x.sum()) / n, float(y.sum()) / n
+        x -= mx
+        y -= my
+        sxx = float((x * x).sum())
+        period = float((x * y).sum()) / sxx if sxx > 0 else self.period_ns
         if n < 8 and self.nominal_ns is not None:
             period = self.nominal_ns  # a configured rate beats a fit over less than a second
         if not 0.5 * self.period_ns < period < 2.0 * self.period_ns:
             period = self.period_ns
         # the line lies on the envelope: through the mean of the bins, then down to the mean of the lower half
-        r = y - my - period * (x - mx)
-        low = float(np.sort(r)[: (n + 1) // 2].sum() / ((n + 1) // 2))
-        target = float(t[-1]) + my + low + period * (float(c_now - int(c[-1])) - mx)
+        y -= x * period
+        y.sort()
+        low = float(y[: (n + 1) // 2].sum()) / ((n + 1) // 2)
+        target = float(t_last) + my + low + period * (float(c_now - c_last) - mx)
         here = self._t0 + (c_now - self._c0) * self.period_ns
         slew = self.SLEW if self._bin_t[-1] - self._bin_t[0] >= self.BIN_NS else self.SLEW_YOUNG
         limit = slew * max(self.period_ns, here - self._last_t) if self._last_t >= 0 else float(self.RESET_NS)

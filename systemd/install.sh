@@ -191,7 +191,7 @@ uninstall() {
     if [ -L "$ROOT$COMMAND" ] && [ "$(readlink "$ROOT$COMMAND")" = $VENV/bin/edge-agent ]; then
         rm -f "$ROOT$COMMAND"
     fi
-    rm -rf "$ROOT$OPT"
+    rm -rf "$ROOT$OPT" "$ROOT/run/$NAME"
     if [ -n "$PURGE" ]; then
         rm -rf "$ROOT$ETC" "$ROOT$DATA" "$ROOT$UNIT.d"
         if live && getent passwd $NAME >/dev/null; then

@@ -89,7 +89,11 @@ class Live:
         run_id: str = "test",
         found: Sequence[Fault] = (),
         make_recorder: Callable[..., Recorder] = Recorder,
+        status_dir: Path | None = None,
+        make_port: Callable[[str], Any] | None = None,
+        now: Callable[[], int] = lambda: 0,
     ) -> None:
+        """`now` decides what hangs; by default its time stands still, so that a slow machine is no fault."""
         data_dir = Path(settings.data_dir)
         data_dir.mkdir(parents=True, exist_ok=True)
         attachments = {"config.yaml": settings.text.encode(), **dict(settings.files)}
@@ -97,7 +101,10 @@ class Live:
             data_dir, settings.record, settings.site, runtime.run_metadata(settings, run_id), attachments, free_bytes
         )
         self.said: list[str] = []
-        self.agent = runtime.Agent(settings, assemble.pipeline(settings), ports, recorder, self.said.append)
+        pipeline = assemble.pipeline(settings)
+        self.agent = runtime.Agent(
+            settings, pipeline, ports, recorder, self.said.append, None, status_dir, make_port, now
+        )
         self.ports = ports
         self.put = {"inbox": 0, "outbox": 0}
         self.taken = {"inbox": 0, "outbox": 0}

@@ -15,6 +15,7 @@ PURE = [
     "edge_agent/timebase.py",
     "edge_agent/geodesy.py",
     "edge_agent/pipeline.py",
+    "edge_agent/judge.py",
     "edge_agent/recording/topics.py",
     "edge_agent/recording/schemas.py",
     "edge_agent/recording/cdr.py",
@@ -23,6 +24,9 @@ PURE = [
     "drivers/binary_frames.py",
     "drivers/dbc_codec.py",
     "drivers/can_signals.py",
+    "drivers/can_assembly.py",
+    "drivers/accel_watch.py",
+    "drivers/slcan_lines.py",
     *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "edge_agent/fusion").glob("*.py"))),
 ]
 OWN = ("edge_agent", "drivers")
@@ -83,3 +87,9 @@ def test_the_pipeline_knows_no_driver_and_the_fusion_only_messages() -> None:
 def test_replay_imports_no_port(name: str) -> None:
     names = own(ROOT / f"edge_agent/{name}.py")
     assert not {n for n in names if n.endswith("_port") or "runtime" in n}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "edge_agent/review").glob("*.py")), ids=lambda p: p.name)
+def test_the_review_imports_no_port_no_runtime_and_no_picture_library(path: Path) -> None:
+    assert not {n for n in own(path) if n.endswith("_port") or "runtime" in n or "simulate" in n}
+    assert not {n.split(".")[0] for n in imports(path)} & {"time", "threading", "socket", "subprocess", "matplotlib"}

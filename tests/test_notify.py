@@ -23,3 +23,13 @@ def test_lines_arrive_as_one_datagram(tmp_path: Path, abstract: bool) -> None:
 def test_nobody_listens_and_nothing_happens(tmp_path: Path) -> None:
     Notifier(None).send("READY=1")
     Notifier(str(tmp_path / "gone")).send("READY=1")
+
+
+def test_a_supervisor_that_does_not_read_holds_nobody_up(tmp_path: Path) -> None:
+    path = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:
+        server.bind(path)
+        notifier = Notifier(path)
+        for i in range(1000):  # many times what the kernel queues; blocking would never end
+            notifier.send(f"STATUS={i}")
+        assert server.recv(100) == b"STATUS=0"

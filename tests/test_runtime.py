@@ -13,14 +13,14 @@ import pytest
 from live import Live, ScriptedPort, decoded, faults, ledgers, raws, recordings, stored, until, values
 
 from drivers import PortError
-from edge_agent import assemble, config, runtime
+from edge_agent import assemble, config, reading, writing
 from edge_agent.messages import MS, Config, Fault, Raw, Record, Rotate, S, Tick
 from edge_agent.pipeline import Pipeline
 from edge_agent.queues import ByteQueue
+from edge_agent.reading import Account, Arrival, PortWatch, Reader
 from edge_agent.recording.reader import read_messages
 from edge_agent.recording.segments import Recorder
 from edge_agent.replay import replay
-from edge_agent.runtime import Account, Arrival, PortWatch, Reader
 from edge_agent.simulate import SCENARIOS, simulate
 from edge_agent.simulate.encode import config_yaml, dbc_text, raw_blocks
 from edge_agent.simulate.specs import EPOCH_UTC_NS, START_NS
@@ -248,7 +248,7 @@ def reader(port: Any, stop: Any) -> list[Arrival]:
     thread = Reader("gnss", port, inbox, Account(), stop)
     thread.run()  # in this thread
     assert thread.failure is None
-    return inbox.take(0.0)
+    return list(inbox.take(0.0))
 
 
 def test_a_lost_port_is_tried_again_after_1_2_4_up_to_60_s() -> None:
@@ -275,7 +275,7 @@ def test_data_makes_the_reader_patient_no_longer_than_a_second() -> None:
 def test_a_port_that_comes_and_goes_is_on_faults_and_the_others_go_on(
     script: list[Raw], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runtime, "BACKOFF_S", (0.01, 0.02))
+    monkeypatch.setattr(reading, "BACKOFF_S", (0.01, 0.02))
     made = ports()
     made[CAN].refuse.append(PortError("CAN slcan x: cannot be opened: there is no such device"))
     with Live(settings(tmp_path), made) as live:
@@ -285,7 +285,8 @@ def test_a_port_that_comes_and_goes_is_on_faults_and_the_others_go_on(
         live.play([r for r in script[60:90] if r.source != GNSS])
         live.play(script[90:200])
     files = recordings(tmp_path / "rec")
-    told = [(f["source"], f["kind"]) for f in faults(files)]
+    # SILENT besides is right where this machine was so slow that main stepped seconds of the script without a block.
+    told = [(f["source"], f["kind"]) for f in faults(files) if f["kind"].startswith("PORT_")]
     assert [k for s, k in told if s == CAN] == ["PORT_LOST", "PORT_OPEN"]
     assert [k for s, k in told if s == GNSS] == ["PORT_LOST", "PORT_LOST", "PORT_OPEN"]
     assert made[GNSS].counters["opens"] == 3
@@ -342,6 +343,19 @@ def test_frames_that_nobody_knows_are_said() -> None:
     assert watch.look(10 * S, counts(10, 5)) == ("OK", "good samples come")
 
 
+def test_bus_off_is_said_at_once_and_is_over_with_the_next_sample() -> None:
+    """GIVEN a bus that works WHEN the controller leaves it, and tries in vain THEN it is told once, until data come."""
+    watch = PortWatch("can")
+    told = []
+    for t in range(16):  # bus-off at 3, 4 and 5 s, an error frame each; samples again from 7 s on
+        good, off = min(t, 2) + max(t - 6, 0), min(max(t - 2, 0), 3)
+        told.append(watch.look(t * S, {"bytes": good + off, "good": good, "positions": 0, "bus_off": off}))
+    seen = [(t, x[0]) for t, x in enumerate(told) if x]
+    assert seen == [(3, "BUS_OFF"), (7, "OK")]
+    assert told[3] is not None
+    assert "short circuit" in told[3][1]
+
+
 def test_states_reach_the_recording(tmp_path: Path) -> None:
     with Live(settings(tmp_path), ports()) as live:
         for i in range(12):
@@ -375,9 +389,11 @@ def test_a_full_inbox_drops_the_newest_and_says_how_many(script: list[Raw], tmp_
         live.play(script[100:101])
         assert entered.wait(60)
         live.play(script[101:300])  # nobody takes them
-        room, kept, dropped = 20_000, script[:101], []
+        # what main has in its hand counts until it is done
+        room = 20_000 - reading.payload_size(script[100].payload) - reading.RECORD_OVERHEAD
+        kept, dropped = script[:101], []
         for raw in script[101:300]:
-            size = runtime.payload_size(raw.payload) + runtime.RECORD_OVERHEAD
+            size = reading.payload_size(raw.payload) + reading.RECORD_OVERHEAD
             if room >= size:
                 room -= size
                 kept.append(raw)
@@ -444,7 +460,10 @@ def test_a_full_outbox_refuses_derived_records_first_and_verify_knows(script: li
         assert at < len(script) - 30, "the outbox should be full long before the script ends"
         Gated.gate.set()
         live.settle()
-        live.play(script[at:])
+        for raw in script[at:]:
+            live.play([raw], step=True)
+            if 2 * live.agent.outbox.bytes > live.agent.outbox.limit_bytes:  # a checkpoint alone is larger
+                live.settle()
         live.settle()
     files = recordings(tmp_path / "rec")
     told = losses(files)
@@ -501,6 +520,6 @@ def test_a_card_that_does_not_answer_is_no_crash(monkeypatch: pytest.MonkeyPatch
     def broken(path: object) -> None:
         raise OSError(5, "Input/output error")
 
-    assert runtime.free_bytes(tmp_path / "not" / "there") > 0
-    monkeypatch.setattr(runtime.shutil, "disk_usage", broken)
-    assert runtime.free_bytes(tmp_path) == -1
+    assert writing.free_bytes(tmp_path / "not" / "there") > 0
+    monkeypatch.setattr(writing.shutil, "disk_usage", broken)
+    assert writing.free_bytes(tmp_path) == -1

@@ -21,7 +21,7 @@ from live import PATIENCE_S, Live, ScriptedPort, decoded, faults, ledgers, raws,
 
 import drivers.serial_port
 from drivers.serial_port import SerialPort
-from edge_agent import config, runtime
+from edge_agent import config, reading, writing
 from edge_agent.__main__ import main
 from edge_agent.messages import Config, PortSettings, Raw, Record, Rotate, S, Tick
 from edge_agent.recording import segments, topics, writer
@@ -31,6 +31,7 @@ from edge_agent.simulate import SCENARIOS, simulate
 from edge_agent.simulate.encode import Wiring, config_yaml, dbc_text, raw_blocks
 from edge_agent.simulate.play import Sink, Slcan, Terminal, can_schedule, play, serial_schedule, wait_ready
 from edge_agent.simulate.specs import START_NS
+from edge_agent.verify import verify
 
 GNSS, CAN, CLOCK = "gnss", "can", "clock"
 SCENARIO = SCENARIOS["clean"]
@@ -179,6 +180,9 @@ def test_sigkill_under_load_then_recover_and_the_next_run_in_the_same_folder(tmp
         waited += sum(r.order < order for r in raws([f]))
     assert waited >= 2
     assert report.raws == len(raws(files)) - waited
+    verdict = verify([site.rec])
+    assert verdict.wanting == []
+    assert [g.reason for g in verdict.gaps if g.source == "all"] == ["kill"]
 
 
 def test_a_run_killed_at_its_first_checkpoint_is_not_taken_for_the_beginning_of_the_next(
@@ -235,7 +239,7 @@ class Plug:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drivers.serial_port, "COALESCE_S", 0.001)
     monkeypatch.setattr(drivers.serial_port, "WAIT_S", 0.02)
-    monkeypatch.setattr(runtime, "BACKOFF_S", (0.02, 0.04))
+    monkeypatch.setattr(reading, "BACKOFF_S", (0.02, 0.04))
 
 
 @pytest.mark.usefixtures("quick")
@@ -344,7 +348,7 @@ def flushed(live: Live) -> None:
 
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
-    monkeypatch.setattr(runtime, "RETRY_NS", 20_000_000)
+    monkeypatch.setattr(writing, "RETRY_NS", 20_000_000)
     return Disk(monkeypatch)
 
 
@@ -383,6 +387,9 @@ def test_a_full_disk_is_waited_for_in_memory(
     assert [stored([f])[0].topic for f in files] == ["/raw/checkpoint"] * len(files)
     told = [f["kind"] for f in faults(files) if f["source"] == "recorder" and f["kind"].startswith("DISK")]
     assert told == ["DISK_FULL", "DISK_OK"]
+    verdict = verify(files)
+    assert verdict.wanting == []
+    assert {g.reason for g in verdict.gaps} == {"disk"}
     orders = [r.order for r in raws(files)]
     gone = set(range(orders[0], len(script))) - set(orders)
     assert gone  # what waited in the chunk, and what came up to main's Rotate; nothing of the long wait
@@ -418,6 +425,9 @@ def test_a_disk_that_stays_full_costs_what_the_ring_cannot_hold_and_says_so(
     files = recordings(tmp_path / "rec")
     assert len(files) == 2
     assert "RING_FULL" in {f["kind"] for f in faults(files)}
+    verdict = verify(files)
+    assert verdict.wanting == []
+    assert {g.reason for g in verdict.gaps} == {"disk"}
     orders = [r.order for r in raws(files)]
     gone = set(range(len(script))) - set(orders)
     assert len(gone) > 100

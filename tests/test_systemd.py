@@ -30,6 +30,7 @@ from edge_agent.messages import (
     RecordSettings,
     SignalField,
     Structure,
+    TriggerSettings,
 )
 
 SYSTEMD = Path(__file__).resolve().parents[1] / "systemd"
@@ -102,6 +103,7 @@ def test_the_unit_keeps_what_was_promised() -> None:
         "ExecStart=/opt/edge-agent/venv/bin/edge-agent run -c /etc/edge-agent/site.yaml",
         "StateDirectory=edge-agent",
         "RuntimeDirectory=edge-agent",
+        "RuntimeDirectoryPreserve=yes",
         "MemoryMax=256M",
         "Restart=always",
         "TimeoutStopSec=30",
@@ -144,6 +146,7 @@ def written(tree: dict[str, Any]) -> dict[type, list[dict[str, Any]]]:
         AccelerometerSettings: accelerometers,
         PointSettings: list(tree["points"].values()),
         SignalField: fields,
+        TriggerSettings: list(tree["triggers"].values()),
     }
 
 

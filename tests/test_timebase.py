@@ -187,3 +187,17 @@ def test_wall_map_reports_a_step_once() -> None:
     wall = WallMap()
     steps = [wall.tick(i * S, Tick(UTC0 + i * S + (86_400 * S if i > 5 else 0), False, 0)) for i in range(10)]
     assert steps == [0] * 6 + [86_400 * S] + [0] * 3
+
+
+def test_a_sentence_that_is_no_fix_has_its_epochs_time_and_teaches_nothing() -> None:
+    clock = FixClock(200.0)
+    wall = WallMap()
+    assert clock.time_of(UTC0, 5 * S) == 5 * S - 200 * MS  # no fix has been seen
+    for i in range(20):
+        t_ns, _, _ = clock.time(fix(UTC0 + i * S, 5 * S + i * S), wall)
+    state = clock.save()
+    for late in (0, 30 * MS, S):  # behind its fix in the same burst
+        assert clock.time_of(UTC0 + 19 * S, 24 * S + late) == t_ns
+    for utc_ns in (0, UTC0 + 3600 * S, UTC0 + 25 * S, UTC0):  # no time, or one that cannot be
+        assert clock.time_of(utc_ns, 24 * S) == 24 * S - 200 * MS
+    assert clock.save() == state

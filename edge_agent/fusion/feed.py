@@ -1,5 +1,5 @@
 """Accelerations into the ring: only newer ones, only complete ones, gaps bridged. A saturated sample says only that
-the motion was beyond the range, so it is left out like one that never came.
+the motion was beyond the range, a spike or a stuck axis says nothing: they are left out like samples that never came.
 
 A gap is an interval longer than 3.5 usual ones and 50 ms; shorter ones are what a lost frame makes, and a straight line
 across them is better than anything else. Across a gap stands the mean of the last `accel_mean_s`, with white noise
@@ -17,7 +17,8 @@ from edge_agent.fusion.integrals import CHUNK, NS, SYNTHETIC, Ring
 from edge_agent.fusion.point import Gap, Point
 from edge_agent.messages import F64, I64, AccelBlock, AccelFlag, Event, FusionSettings, S
 
-_SATURATED = np.uint8(AccelFlag.SATURATED)
+_STUCK = np.uint8(AccelFlag.STUCK)
+_UNUSED = np.uint8(AccelFlag.SATURATED | AccelFlag.SPIKE | AccelFlag.STUCK)
 NOMINAL = 33
 LEAST_GAP_NS = 50_000_000
 GAPS = 64
@@ -31,6 +32,7 @@ class Feed:
         self.points = points
         self.settings = settings
         self.ring = Ring(len(points))
+        self.doubted: list[int] = []  # points whose accelerometer has just been found stuck; the station takes them
         self.of: dict[str, list[int]] = {}
         for i, p in enumerate(points):
             if p.accelerometer is not None:
@@ -48,12 +50,18 @@ class Feed:
                 continue
             t, a = b.t_ns[lo : lo + CHUNK], b.xyz[lo : lo + CHUNK]
             more = more or len(b.t_ns) > lo + CHUNK
-            clipped = b.flags[lo : lo + CHUNK] & _SATURATED
-            if clipped.any() or not np.isfinite(a).all():
-                good = np.isfinite(a).all(axis=1) & (clipped == 0)
+            unused = b.flags[lo : lo + CHUNK] & _UNUSED
+            stuck = False
+            if np.count_nonzero(unused) or np.count_nonzero(np.isfinite(a)) < a.size:
+                stuck = bool((unused & _STUCK).any())
+                good = np.isfinite(a).all(axis=1) & (unused == 0)
                 t, a = t[good], a[good]
-                if not len(t):
-                    continue
+            for p in points:
+                if stuck and not self.points[p].stuck:
+                    self.doubted.append(p)
+                self.points[p].stuck = stuck
+            if not len(t):
+                continue
             longest = int((t[1:] - t[:-1]).max()) if len(t) > 1 else 0
             for p in points:
                 done = self._one(p, t, a, longest, even, events)
@@ -69,7 +77,7 @@ class Feed:
         """Rows up to t without accelerations."""
         ring = self.ring
         ring_end = ring.last_ns[p]
-        mean, q, opened = self._mean(p)
+        mean, q, opened = self.across(p)
         times = [ring_end, t_ns] if opened else [t_ns]
         self._synthetic(p, times, mean)
         self._gap(p, ring_end, t_ns, q)
@@ -87,7 +95,9 @@ class Feed:
                 return False
             t0 = int(t[0])
         if last < 0:
-            pt.run_ns = last = t0
+            last = t0
+        if pt.run_ns < 0:
+            pt.run_ns = t0
         bridged = pt.hold is not None
         limit = max(LEAST_GAP_NS, pt.nominal_ns * 7 // 2)
         if pt.nominal_ns and not bridged and longest <= limit and t0 - last <= limit:
@@ -123,7 +133,7 @@ class Feed:
         """A gap ends at sample time t."""
         pt = self.points[p]
         last = self.ring.last_ns[p]
-        mean, q, opened = self._mean(p)
+        mean, q, opened = self.across(p)
         self._synthetic(p, [last, t_ns] if opened else [t_ns], mean)
         self._gap(p, last, t_ns, q)
         g = pt.hold
@@ -151,16 +161,24 @@ class Feed:
             gaps[1] = Gap(gaps[0].begin_ns, gaps[1].end_ns, np.maximum(gaps[0].q, gaps[1].q))
             del gaps[0]
 
-    def _mean(self, p: int) -> tuple[F64, F64, bool]:
+    def across(self, p: int) -> tuple[F64, F64, bool]:
         """Mean with gravity (3,), q_gap (3,), and whether the gap begins here; else the one that goes on is held."""
         ring = self.ring
         pt = self.points[p]
         h = ring.head[p]
         if pt.hold is not None:
             return ring.a[p, h - 1] + ring.reference[p], pt.hold.q, False
-        t, a = ring.recent(p, ring.last_ns[p], self.settings.accel_mean_s)
-        if len(t) < 8:
+        usual = self.vibration(p, ring.last_ns[p], self.settings.accel_mean_s)
+        if usual is None:
             return ring.a[p, h - 1] + ring.reference[p], np.full(3, 1e-3), True
+        mean, var, tau = usual
+        return mean + ring.reference[p], 2.0 * var * tau + 1e-12, True
+
+    def vibration(self, p: int, until_ns: int, seconds: float) -> tuple[F64, F64, F64] | None:
+        """Mean less reference, variance, reciprocal mean angular frequency (3,) of the last accelerations."""
+        t, a = self.ring.recent(p, until_ns, seconds)
+        if len(t) < 8:
+            return None
         mean = a.sum(axis=0) * (1.0 / len(a))
         e = a - mean
         var = (e * e).sum(axis=0) * (1.0 / len(a))
@@ -168,7 +186,7 @@ class Feed:
         rate = (d * d).sum(axis=0) * (1.0 / len(d))
         h_s = (int(t[-1]) - int(t[0])) * NS / (len(t) - 1)
         tau = np.minimum(np.maximum(np.sqrt(var / np.maximum(rate, 1e-30)) * h_s, h_s), 0.5)
-        return mean + ring.reference[p], 2.0 * var * tau + 1e-12, True
+        return mean, var, tau
 
     def _synthetic(self, p: int, times: list[int], mean: F64) -> None:
         n = len(times)

@@ -13,7 +13,8 @@ motion. The offset ends
 Refusals that agree on nothing for `lockout_s` mean that the prediction is wrong, not the fixes: the filter begins anew
 at the next one (REACQUIRE), so nothing locks out. After a float spell
 or an outage that left the prediction too wide to protect (P > 25 R) three fixes in a row must agree before one is
-used.
+used. Without accelerations a motion that begins suddenly looks like a small jump: two misfits in a row that agree are
+followed (FOLLOW).
 
 Scalars only: this runs per point and only while a point is not calm.
 """
@@ -72,6 +73,7 @@ class Action(enum.IntEnum):
     REACQUIRE = 8  # the prediction is worth nothing: begin anew at this fix
     RESUME = 9  # three agree after an outage: use
     CONSUMED = 10  # refused, but counted towards closing
+    FOLLOW = 11  # motion that was not predicted: widen, then use
 
 
 HISTORY = 8
@@ -109,9 +111,11 @@ class Gate:
         since_used_ns: int,
         reacquire_ns: int,
         lockout_ns: int,
+        follow: bool = False,
     ) -> Action:
         """What to do with a fix. `level` = z - d predicted; `R` its noise variance, `Pv` the velocity's; `evidence` =
-        log-likelihood of o = 0 less that of the estimated o for this fix."""
+        log-likelihood of o = 0 less that of the estimated o for this fix; `follow`: two misfits in a row that agree are
+        motion."""
         if need_confirm and not self.confirm:
             self.confirm = True
             self.confirm_ns = t_ns
@@ -144,6 +148,7 @@ class Gate:
             if self.fits_zero >= AGREE and self.ratio > CLOSE_RATIO:
                 self.forget()
                 return Action.CLOSE
+        before = self.history[-1] if self.history else None
         self._push(t_ns, not fits, level, R)
         if fits:
             if not self.open:
@@ -151,6 +156,9 @@ class Gate:
                 return Action.USE
             return Action.OFFSET
         self.calm = False
+        if follow and before and before[1] and self._agree(t_ns, level, R, Pv, (before[0], *before[2:]), limit):
+            self.history = []
+            return Action.FOLLOW
         if self.open and fits_zero:
             return Action.CONSUMED
         agreeing = [h for h in self.history if h[1] and self._agree(t_ns, level, R, Pv, (h[0], h[2], h[3]), limit)]

@@ -168,6 +168,30 @@ class Ring:
         out[3:] = g[3:] + total * (s * 0.5)
         return i, a1, out
 
+    def anchor(self, points: list[int], t_ns: int) -> tuple[F64, F64]:
+        """Integrals g (P', 6) at t and the sum of `bend` (P', 3) of the rows at or before it, of some points at once;
+        as `at`, whose arithmetic it is."""
+        if len(points) == 1:
+            p = points[0]
+            i, _, one = self.at(p, t_ns)
+            return one[None], self.bent[p, i][None]
+        rows = []
+        for p in points:
+            i = int(self.t[p, : self.head[p]].searchsorted(t_ns, side="right")) - 1
+            if i < 0 or t_ns > self.last_ns[p]:
+                raise ValueError("integrals: the time lies outside of the ring")
+            rows.append(i)
+        k, i0 = np.array(points), np.array(rows)
+        i1 = np.minimum(i0 + 1, np.array(self.head)[k] - 1)
+        t0, t1 = self.t[k, i0], self.t[k, i1]
+        a0, g = self.a[k, i0], self.g[k, i0]
+        dt = t_ns - t0
+        s = (dt * NS)[:, None]
+        total = a0 + (a0 + (self.a[k, i1] - a0) * (dt / np.maximum(t1 - t0, 1))[:, None])
+        g[:, :3] += s * (g[:, 3:] + (total + a0) * (s * (1 / 6)))
+        g[:, 3:] += total * (s * 0.5)
+        return g, self.bent[k, i0]
+
     def covers(self, p: int, t_ns: int) -> bool:
         """Whether a fix at t finds its accelerations: not later than the newest row, not older than LATEST_NS or LATEST
         rows before it. The bound is tighter than what is kept: a loaded ring answers as the saved one did."""

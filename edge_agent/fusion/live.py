@@ -15,32 +15,35 @@ from edge_agent.fusion.point import Gap
 from edge_agent.messages import F64, I64
 
 
-def stream(t: I64, g: F64, anchor_ns: I64, x: F64, C: F64, g0: F64, q: F64, qb: F64) -> tuple[F64, F64]:
+def stream(t: I64, g: F64, anchor_ns: I64, x: F64, C: F64, g0: F64, q: F64, qb: F64) -> F64:
     """Rows t (P, n), integrals g (P, n, 6) as (g2, g1); x (N, P, 3), C, and g0 (P, 6) at the anchors (P,).
 
-    Returns (P, n, 6): displacement and velocity, and their variances.
+    Returns (12, P, n): displacement and velocity, then their variances; samples last, so that one operation is a few
+    long loops and not many short ones.
     """
-    dt = ((t - anchor_ns[:, None]) * NS)[:, :, None]
-    c = np.zeros((3, len(x[0]), 6))
-    v = x[V] - g0[:, 3:]
-    c[0, :, :3] = x[D] - g0[:, :3]
-    c[0, :, 3:] = v
-    c[1, :, :3] = v
-    c[1, :, 3:] = -x[B]
-    c[2, :, :3] = x[B] * -0.5
-    k = c[:, :, None]
-    y = k[2] * dt
+    out = np.empty((12, *t.shape))
+    y, var = out[:6], out[6:]
+    dt = (t - anchor_ns[:, None]) * NS
+    c = np.zeros((3, 6, len(t)))
+    start, slope, b = x[D] - g0[:, :3], x[V] - g0[:, 3:], x[B]
+    c[0, :3] = start.T
+    c[0, 3:] = slope.T
+    c[1, :3] = slope.T
+    c[1, 3:] = -b.T
+    c[2, :3] = b.T * -0.5
+    k = c[..., None]
+    np.multiply(k[2], dt, out=y)
     y += k[1]
     y *= dt
     y += k[0]
-    y += g
-    k = growth(C, q, qb)[:, :, None]
-    var = k[5] * dt
+    y += g.T.swapaxes(1, 2)
+    k = growth(C, q, qb)[..., None]
+    np.multiply(k[5], dt, out=var)
     for i in (4, 3, 2, 1):
         var += k[i]
         var *= dt
     var += k[0]
-    return y, var
+    return out
 
 
 def add_gaps(gaps: list[Gap], anchor_ns: int, t: I64, var: F64) -> None:

@@ -63,26 +63,22 @@ def gap_noise(length: F64 | float, since: F64 | float, q: F64) -> tuple[F64, F64
     return dd, dv, vv
 
 
-# Rows: coefficients of (1, D, ..., D^5) of the variance of d, then of v, D after the anchor; columns: dd dv db vv vb bb
-# of the covariance at the anchor, q, qb. From F C F' + Q(D).
-_GROWTH = np.zeros((12, 8))
-for _row, _column, _factor in (
-    (0, 0, 1.0), (1, 1, 2.0), (2, 3, 1.0), (2, 2, -1.0), (3, 4, -1.0), (3, 6, 1 / 3), (4, 5, 0.25), (5, 7, 1 / 20),
-    (6, 3, 1.0), (7, 4, -2.0), (7, 6, 1.0), (8, 5, 1.0), (9, 7, 1 / 3),
-):  # fmt: skip
-    _GROWTH[_row, _column] = _factor
-_I = np.array([0, 0, 0, 1, 1, 2])
-_J = np.array([0, 1, 2, 1, 2, 2])
-
-
 def growth(C: F64, q: F64, qb: F64) -> F64:
-    """Polynomial coefficients in D of the variances of d and v after the anchor: (6, P, 6), channels d xyz, v xyz."""
-    basis = np.empty((8, *q.shape))
-    basis[:6] = C[_I, _J]
-    basis[6] = q
-    basis[7] = qb
-    c = (_GROWTH[:, :, None, None] * basis).sum(axis=1)
-    out = np.empty((6, q.shape[0], 6))
-    out[:, :, :3] = c[:6]
-    out[:, :, 3:] = c[6:]
+    """Polynomial coefficients in D of the variances of d and v after the anchor, from F C F' + Q(D): (6, 6, P), of
+    (1, D, ..., D^5); channels d xyz, v xyz. C (N, N, P, 3), q and qb (P, 3)."""
+    dd, dv, db = C[D, D].T, C[D, V].T, C[D, B].T
+    vv, vb, bb = C[V, V].T, C[V, B].T, C[B, B].T
+    q, qb = q.T, qb.T
+    out = np.zeros((6, 6, q.shape[1]))
+    d, v = out[:, :3], out[:, 3:]
+    d[0] = dd
+    d[1] = dv * 2.0
+    d[2] = vv - db
+    d[3] = q * (1 / 3) - vb
+    d[4] = bb * 0.25
+    d[5] = qb * (1 / 20)
+    v[0] = vv
+    v[1] = q - vb * 2.0
+    v[2] = bb
+    v[3] = qb * (1 / 3)
     return out

@@ -22,6 +22,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from edge_agent.fusion.integrals import block
 from edge_agent.messages import F64, Quality, State
 
 CHI1_MEDIAN = 0.45493642311957283
@@ -88,8 +89,8 @@ class Bank:
         beta = [b for _ in q_ratios for b in qb_ratios]
         self.rho: F64 = np.array(rho)[:, None]
         self.beta: F64 = np.array(beta)[:, None]
-        self.log_rho = [math.log(v) for v in rho]
-        self.log_beta = [math.log(v) for v in beta]
+        self.log_rho: F64 = np.array([math.log(v) for v in rho])
+        self.log_beta: F64 = np.array([math.log(v) for v in beta])
         m = len(rho)
         self.x: F64 = np.zeros((3, m, points, 3))
         self.C: F64 = np.zeros((6, m, points))  # dd dv db vv vb bb
@@ -185,25 +186,25 @@ class Bank:
         if n < 4.0:
             return []
         out = []
-        sum_l = self.sum_l[:, p].tolist()
+        sum_l = self.sum_l[:, p]
+        r = self.sum_e[:, p].T / n + R_TINY
+        logs = _logs(r)
         for axis in range(3):
-            e = self.sum_e[:, p, axis].tolist()
             c, w, cb, wb = prior[axis]
-            score = []
-            for i, v in enumerate(e):
-                u = self.log_rho[i] - c
-                ub = self.log_beta[i] - cb
-                score.append(-0.5 * (sum_l[i] + n * math.log(v / n + R_TINY) + w * u * u + wb * ub * ub))
-            top = max(score)
-            best = score.index(top)
+            u = self.log_rho - c
+            ub = self.log_beta - cb
+            score = -0.5 * (sum_l + n * logs[axis] + w * u * u + wb * ub * ub)
+            best = int(score.argmax())
+            top = float(score[best])
             total = mean = mean_b = mean_r = 0.0
-            for i, v in enumerate(score):
-                if v > top - 25.0:
-                    f = math.exp(v - top)
-                    total += f
-                    mean += f * self.log_rho[i]
-                    mean_b += f * self.log_beta[i]
-                    mean_r += f * math.log(e[i] / n + R_TINY)
+            near = (score > top - 25.0).nonzero()[0]
+            rows = zip(*(v.take(near).tolist() for v in (score, self.log_rho, self.log_beta, logs[axis])), strict=True)
+            for v, rho, beta, log_r in rows:
+                f = math.exp(v - top)
+                total += f
+                mean += f * rho
+                mean_b += f * beta
+                mean_r += f * log_r
             out.append((mean / total, mean_b / total, mean_r / total, best))
         return out
 
@@ -252,38 +253,58 @@ class Monitor:
         self.since[p] = 0.0
         self.alarm[p] = False
 
-    def fix(self, p: int, dt: float, z: F64, R: F64, nu: F64, S: F64, limit: float) -> bool:
-        """Take a fix z (3,) with noise R, and the fused filter's residual and variance; True = the alarm changed."""
-        self.since[p] += dt
-        if self.bank.fresh[p]:
-            self.bank.reset(p, z, np.zeros(3), np.zeros(3))
-            self.since[p] = 0.0
-            return False
-        if self.since[p] < self.STEP_S:
-            return False
-        elapsed = self.since[p]
-        self.since[p] = 0.0
+    def fix(
+        self, points: Sequence[int], dt: Sequence[float], z: F64, R: F64, nu: F64, S: F64, limit: float
+    ) -> list[int]:
+        """Take a fix z (3,) of some points, with its noise R and the fused filter's residual and variance (P', 3);
+        returns the points whose alarm changed."""
+        due: list[int] = []
+        rows: list[int] = []
+        elapsed: list[float] = []
+        for i, p in enumerate(points):
+            since = self.since[p] + dt[i]
+            if self.bank.fresh[p]:
+                self.bank.reset(p, z, _ZERO, _ZERO)
+                since = 0.0
+            elif since >= self.STEP_S:
+                due.append(p)
+                rows.append(i)
+                elapsed.append(since)
+                since = 0.0
+            self.since[p] = since
+        return self._take(due, elapsed, z, R[rows], nu[rows], S[rows], limit) if due else []
+
+    def _take(self, due: list[int], elapsed: list[float], z: F64, R: F64, nu: F64, S: F64, limit: float) -> list[int]:
         bank = self.bank
-        zero = np.zeros((1, 3))
-        bank.predict([p], np.array([elapsed]), zero, zero)
-        s = (bank.C[0, :, p] + 1.0)[:, None] * R
-        e = z - bank.x[0, :, p]
+        k = block(due)
+        none = np.zeros((len(due), 3))
+        bank.predict(k, np.array(elapsed), none, none)
+        s = (bank.C[0][:, k] + 1.0)[..., None] * R
+        e = z - bank.x[0][:, k]
         e = e * e / s
-        self.count[p] += 1
-        w = max(min(elapsed / self.MEMORY_S, 0.5), 1.0 / self.count[p])
-        logs = np.array([math.log(v) for v in s.reshape(-1).tolist()]).reshape(s.shape)
-        self.score[:, p] += w * (logs + np.minimum(e, self.CLIP) - self.score[:, p])
-        logs = np.array([math.log(v) for v in S.tolist()])
-        self.fused[p] += w * (logs + np.minimum(nu * nu / S, self.CLIP) - self.fused[p])
-        total = e.sum(axis=1).tolist()
-        if min(total) <= limit:  # else an outlier for every member
-            bank.update([p], z[None], np.ones(1))
-            bank.product[:, p] = 1.0  # its own likelihood is not asked for
-        ahead = max((self.fused[p] - self.score[:, p].min(axis=0)).tolist())
-        before = self.alarm[p]
-        if self.count[p] >= self.LEAST:
-            self.alarm[p] = ahead > (self.OFF if before else self.ON)
-        return self.alarm[p] != before
+        weights = []
+        for p, seconds in zip(due, elapsed, strict=True):
+            self.count[p] += 1
+            weights.append(max(min(seconds / self.MEMORY_S, 0.5), 1.0 / self.count[p]))
+        w = np.array(weights)[:, None]
+        score, fused = self.score[:, k], self.fused[k]
+        score = score + w * (_logs(s) + np.minimum(e, self.CLIP) - score)
+        fused = fused + w * (_logs(S) + np.minimum(nu * nu / S, self.CLIP) - fused)
+        self.score[:, k], self.fused[k] = score, fused
+        least = e.sum(axis=2).min(axis=0).tolist()
+        good = [p for p, v in zip(due, least, strict=True) if v <= limit]  # else an outlier for every member
+        if good:
+            j = block(good)
+            bank.update(j, np.broadcast_to(z, (len(good), 3)), np.ones(len(good)))
+            bank.product[:, j] = 1.0  # its own likelihood is not asked for
+        changed = []
+        for p, ahead in zip(due, (fused - score.min(axis=0)).max(axis=1).tolist(), strict=True):
+            before = self.alarm[p]
+            if self.count[p] >= self.LEAST:
+                self.alarm[p] = ahead > (self.OFF if before else self.ON)
+            if self.alarm[p] != before:
+                changed.append(p)
+        return changed
 
     def save(self) -> State:
         return {
@@ -295,6 +316,13 @@ class Monitor:
         self.bank.load(s["bank"])
         self.score, self.fused = s["score"].copy(), s["fused"].copy()
         self.count, self.since, self.alarm = list(s["count"]), list(s["since"]), list(s["alarm"])
+
+
+_ZERO = np.zeros(3)
+
+
+def _logs(a: F64) -> F64:
+    return np.array([math.log(v) for v in a.reshape(-1).tolist()]).reshape(a.shape)
 
 
 def third_difference_std(w: F64) -> list[float]:

@@ -28,7 +28,7 @@ class Wait:
 
 _SIMPLE = (
     "started", "aided", "floating", "uncertain", "anchor_ns", "used_ns", "begun_ns", "posterior_ns", "run_ns",
-    "nominal_ns", "window_aided", "mode", "fixes", "since_bank",
+    "nominal_ns", "window_aided", "mode", "fixes", "since_bank", "stuck",
 )  # fmt: skip
 
 
@@ -48,6 +48,7 @@ class Point:
         self.posterior_ns = 0
         self.run_ns = -1  # accelerations are uninterrupted since
         self.nominal_ns = 0  # interval of the samples, learnt; 0 = not yet
+        self.stuck = False  # the newest samples are of a stuck axis
         self.intervals: list[int] = []
         self.gaps: list[Gap] = []  # that end after the anchor
         self.hold: Gap | None = None  # the gap that goes on, from its begin

@@ -12,7 +12,7 @@ dropped.
 
 Kinds of points. *Both sensors*: as above. *No accelerometer* (or one that is silent for `accel_lost_s`): the same
 filter with zero integrals, where -b is the acceleration and its walk the model; one estimate per fix, mode GNSS_ONLY.
-*No receiver*: there is no absolute displacement; displacement is held about zero by one pseudo-measurement a second
+Of one that fell silent the last 10 s say how much motion to expect at least, as across a gap. *No receiver*: there is no absolute displacement; displacement is held about zero by one pseudo-measurement a second
 with sd `accel_only_std_m`, so vibration above some 0.05 Hz is right and the quasi-static part is not there; mode
 ACCEL_ONLY.
 
@@ -39,6 +39,7 @@ from edge_agent.fusion.point import Point, Wait
 from edge_agent.messages import (
     F64,
     I64,
+    STUCK_SAMPLES,
     U8,
     AccelBlock,
     Estimate,
@@ -73,14 +74,24 @@ REBASE_NS = 30 * S
 PSEUDO_NS = S
 BLOW = 8.0
 """Bending of the accelerations beyond so many times the usual, of the interval and 0.1 s more, is a blow."""
+DOUBT = 4.0
+"""A value that stays is off by the motion and by where in it it stopped: twice the variance of the accelerations; twice
+that, for the motion may have been growing."""
+KNOWN = 4.0
+"""Noise figures known from before the silence or the reboot: half the decades, for it is hardly ever another sensor."""
+FOLLOW = 4.0
+"""Without accelerations, two fixes in a row that agree and are not further away than twice the gate are motion."""
 BEND_S = 60.0
 """Over which the usual bending is averaged."""
 START_FIXES = 2000
 """Fixes of a start window at most: 15 s at more than 100 Hz."""
 PENDING = 256
 """Fixes that wait for accelerations at most; the oldest is applied without them."""
-Piece: TypeAlias = tuple[I64, F64, F64, U8, U8]
-"""t (n,), displacement and velocity (n, 6), their sd (n, 6), mode and flags (n,)."""
+FUSED, ACCEL_ONLY = int(Mode.FUSED), int(Mode.ACCEL_ONLY)
+FLOAT, JUMP_OPEN = int(FusionFlag.FLOAT), int(FusionFlag.JUMP_OPEN)
+UNCERTAIN = int(FusionFlag.TIME_UNCERTAIN)
+Piece: TypeAlias = tuple[I64, F64, U8]
+"""t (n,); displacement, velocity and their sd (12, n); mode and flags (2, n)."""
 
 
 class Station:
@@ -111,12 +122,14 @@ class Station:
         self.bend_rate: F64 = np.zeros((n, 3))  # its usual rate [m2/s3]
         self.q: F64 = np.full((n, 3), settings.accel_noise_m2ps3)
         self.qb: F64 = np.full((n, 3), settings.bias_walk_m2ps5)
+        self.q_least: F64 = np.zeros((n, 3))  # of a point that lost its accelerations
         self.scale: F64 = np.ones((n, 3))  # on the declared R
         self.bank_s1: F64 = np.zeros((n, 3))  # increments since the bank's last fix
         self.bank_s2: F64 = np.zeros((n, 3))
         self.known: list[State | None] = [None] * n  # adopted from an earlier run: centres of the priors
         self.unset = set(unset)
         self.datums: dict[str, F64] = {}
+        self.quiet_ns = int(min(settings.coast_s, settings.invalid_outage_s) * S)
         self.limit = quantile(settings.gate_alpha, 3)
         self.old = 0
         self.prechecked = 0
@@ -133,11 +146,15 @@ class Station:
             points, events, more = self.feed.take(blocks, lo)
             lo += CHUNK
             out += events
+            while self.feed.doubted:
+                self._doubt(self.feed.doubted.pop(), out)
             if points:
                 self._settle(points, now_ns, out, pieces)
                 self._emit(points, None, pieces, out)
-        for p, parts in pieces.items():
-            out.append(self._estimate(p, parts))
+        if pieces:
+            slow = self._slow()
+            for p, parts in pieces.items():
+                out.append(self._estimate(p, parts, slow))
         return out
 
     def fix(self, receiver: str, fix: Measurement, now_ns: int) -> Out:
@@ -172,6 +189,31 @@ class Station:
     def fix_datum(self, receiver: str) -> None:
         """The receiver's reference is known after all: its zero stays where it is."""
         self.unset.discard(receiver)
+
+    def _doubt(self, p: int, out: Out) -> None:
+        """An axis has been stuck for some samples before it was noticed: what they did to the state is as unknown as
+        the accelerations of that time, and a level that fixes seemed to have since is no level."""
+        pt = self.points[p]
+        last = self.ring.last_ns[p]
+        _, a = self.ring.recent(p, last, self.settings.accel_mean_s)
+        if not (pt.started and pt.aided) or len(a) < 8:
+            return
+        e = a - a.sum(axis=0) * (1.0 / len(a))
+        T = STUCK_SAMPLES * pt.nominal_ns * NS
+        v = (e * e).sum(axis=0) * (DOUBT / len(a) * T * T)
+        C = self.C[:, :, p]
+        C[V, V] += v
+        C[D, V] += v * (0.5 * T)
+        C[V, D] += v * (0.5 * T)
+        C[D, D] += v * (T * T / 3.0)
+        if pt.gate.open and pt.gate.begin_ns >= last - STUCK_SAMPLES * pt.nominal_ns:
+            text = "the accelerometer was stuck: the fixes were right"
+            out.append(Event(last, "JUMP_CLOSED", pt.name, text, (), pt.gate.begin_ns, last))
+            pt.gate.forget()
+            self.x[O, p] = 0.0
+            C[O] = 0.0
+            C[:, O] = 0.0
+        self.bank.fresh[p] = True
 
     # ----------------------------------------------------------------------------------------------- fixes meet samples
 
@@ -242,16 +284,17 @@ class Station:
         if live:
             self._step(live, fix, out)
 
-    def _increment(self, p: int, t_ns: int, dt: float) -> tuple[F64, F64, F64]:
-        """Integrals (s1, s2) and the sum of `bend` from the anchor to t; the anchor's move to t, its time does not."""
-        i, _, g = self.ring.at(p, t_ns)
-        old = self.g[p]
+    def _increments(self, points: list[int], t_ns: int, dt: F64) -> tuple[F64, F64, F64]:
+        """Integrals (s1, s2) and the sums of `bend` (P', 3) from the anchors to t; their integrals move to t, their
+        time does not. dt (P', 1) s."""
+        k = block(points)
+        g, bent = self.ring.anchor(points, t_ns)
+        old, before = self.g[k], self.bent[k]
         s = g - old
-        s2 = s[:3] - old[3:] * dt
-        self.g[p] = g
-        bent = self.ring.bent[p, i] - self.bent[p]
-        self.bent[p] = self.ring.bent[p, i]
-        return s[3:], s2, bent
+        s2 = s[:, :3] - old[:, 3:] * dt
+        bend = bent - before
+        self.g[k], self.bent[k] = g, bent
+        return s[:, 3:], s2, bend
 
     def _place(self, p: int, t_ns: int) -> None:
         """The anchor's integrals, without an increment."""
@@ -293,7 +336,9 @@ class Station:
             s1 = s2 = zero
         else:
             dt = (fix.t_ns - pt.anchor_ns) * NS
-            s1, s2, bent = self._increment(p, fix.t_ns, dt) if aided else (zero, zero, zero)
+            s1 = s2 = bent = zero
+            if aided:
+                s1, s2, bent = (v[0] for v in self._increments([p], fix.t_ns, np.array([[dt]])))
             self.bend_rate[p] += (bent / dt - self.bend_rate[p]) * (1.0 / len(pt.window))
         pt.anchor_ns = fix.t_ns
         if aided:
@@ -416,23 +461,28 @@ class Station:
         t = fix.t_ns
         n = len(points)
         seconds: list[float] = []
-        s1 = np.zeros((n, 3))
-        s2 = np.zeros((n, 3))
-        bent = np.zeros((n, 3))
+        aided: list[int] = []  # places in `points`
         calm = fix.quality in SOLID
         for i, p in enumerate(points):
             pt = self.points[p]
-            if pt.accelerometer is not None:
-                self._model(p, t, out)
+            if pt.aided:
+                self._bridge(p, t, out)
             seconds.append((t - pt.anchor_ns) * NS)
             if pt.aided:
-                s1[i], s2[i], bent[i] = self._increment(p, t, seconds[i])
+                aided.append(i)
             calm = calm and pt.gate.calm and not pt.floating and t - pt.used_ns <= 5 * S
+        dt = np.array(seconds)[:, None]
+        if len(aided) == n:
+            s1, s2, bent = self._increments(points, t, dt)
+        else:
+            s1, s2, bent = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
+            if aided:
+                s1[aided], s2[aided], bent[aided] = self._increments([points[i] for i in aided], t, dt[aided])
         k = block(points)
         same = seconds[:1] if seconds.count(seconds[0]) == n else seconds
         Qa, Qb = process_noise(same)
         x, C = kalman.predict(self.x[:, k], self.C[:, :, k], transition(same), Qa, Qb, s1, s2, self.q[k], self.qb[k])
-        self._blows(points, k, C, bent, np.array(seconds)[:, None])
+        self._blows(points, k, C, bent, dt)
         for i, p in enumerate(points):
             if self.points[p].gaps and self.points[p].aided:
                 self._gap_variance(self.points[p], t, C[:, :, i])
@@ -466,12 +516,14 @@ class Station:
         self.x[:, k] = x
         self.C[:, :, k] = C
         std = np.sqrt(R)
+        full = np.zeros((n, 3, 3))
+        full.reshape(n, 9)[:, ::4] = S_
+        offset = x[O].copy()
+        late = fix.arrival_ns - t
         for i, p in enumerate(points):
             pt = self.points[p]
             if not pseudo:
-                offset = x[O, i].copy()
-                late = fix.arrival_ns - t
-                out.append(Innovation(pt.name, t, nu[i], _diagonal(S_[i]), ratio[i], verdicts[i], late, std[i], offset))
+                out.append(Innovation(pt.name, t, nu[i], full[i], ratio[i], verdicts[i], late, std[i], offset[i]))
             pt.anchor_ns = t
             pt.uncertain = fix.time_uncertain
             if used[i]:
@@ -480,12 +532,12 @@ class Station:
                 self._rebase(p, t)
         if not pseudo:
             if fix.quality in SOLID:
-                for i, p in enumerate(points):
-                    if self.points[p].aided:
-                        self._contradiction(p, fix, seconds[i], z, R[i], nu[i], S_[i], out)
+                self._contradiction(points, fix, seconds, z, R, nu, S_, out)
             self._learn_noise(points, k, z, R0, nu, S_, seconds, s1, s2, learn)
         for p in points:
             pt = self.points[p]
+            if not pt.aided and pt.accelerometer is not None:
+                self._resume(p, out)
             bridged = pt.hold is not None and self.ring.last_ns[p] <= t
             if not pseudo and (bridged or not pt.aided):
                 out.append(self._single(p, t, out))
@@ -525,44 +577,56 @@ class Station:
                 C[V, D] += dv
                 C[V, V] += vv
 
-    def _model(self, p: int, t_ns: int, out: Out) -> None:
-        """Accelerations come or are gone: change the model where it must be."""
+    def _bridge(self, p: int, t_ns: int, out: Out) -> None:
+        """Accelerations that are missing up to a fix at t are bridged, or given up."""
         pt = self.points[p]
         s = self.settings
         last = self.ring.last_ns[p]
-        if pt.aided:
-            if last >= t_ns:
-                return
-            begin = last if pt.hold is None else pt.hold.begin_ns
-            if t_ns - begin <= int(s.accel_lost_s * S) or pt.receiver is None:
-                self.feed.bridge(p, t_ns)
-                return
-            pt.aided = False
-            pt.run_ns = -1
-            q = s.gnss_only_q_m2ps3 if pt.hold is None else np.maximum(pt.hold.q, s.gnss_only_q_m2ps3)
-            self._change_model(p, np.zeros(3), np.full(3, 0.05**2), q, s.gnss_only_qb_m2ps5)
-            pt.hold = None
-            seconds = (t_ns - begin) / S
-            text = f"no accelerations for {seconds:.0f} s: going on without"
-            out.append(Event(t_ns, "ACCEL_LOST", pt.name, text, (("silent_s", seconds),), begin, t_ns))
-        elif last >= t_ns and self.ring.covers(p, t_ns) and pt.run_ns >= 0:
-            if t_ns - pt.run_ns < int(s.accel_settle_s * S):
-                return
-            _, a = self.ring.recent(p, t_ns, s.accel_settle_s)
-            if len(a) < 8:
-                return
-            mean = a.sum(axis=0) * (1.0 / len(a))
-            e = a - mean
-            var = (e * e).sum(axis=0) * (1.0 / len(a))
-            self._change_model(p, mean, var + 0.05**2, s.accel_noise_m2ps3, s.bias_walk_m2ps5)
-            pt.aided = True
-            pt.gaps = [g for g in pt.gaps if g.end_ns > t_ns]
-            # This fix still ends an interval without accelerations: its increment must come out as zero.
-            self._place(p, t_ns)
-            self.g[p, :3] -= self.g[p, 3:] * ((t_ns - pt.anchor_ns) * NS)
-            out.append(Event(t_ns, "ACCEL_ON", pt.name, "accelerations are there: fusion goes on with them"))
+        if last >= t_ns:
+            return
+        begin = last if pt.hold is None else pt.hold.begin_ns
+        if t_ns - begin <= int(s.accel_lost_s * S) or pt.receiver is None:
+            self.feed.bridge(p, t_ns)
+            return
+        # The structure goes on as it was seen to vibrate. Fixes alone do not tell vibration from their own noise and
+        # would call it noise, so they may only find more of it.
+        self.q_least[p] = self.feed.across(p)[1]
+        if begin - pt.begun_ns > int(2 * s.bank_full_s * S):
+            self.known[p] = self._figures(p)
+        q = np.maximum(self.q_least[p], s.gnss_only_q_m2ps3)
+        self._change_model(p, np.zeros(3), np.full(3, 0.05**2), q, s.gnss_only_qb_m2ps5)
+        pt.aided = False
+        pt.run_ns = -1
+        pt.hold = None
+        seconds = (t_ns - begin) / S
+        text = f"no accelerations for {seconds:.0f} s: going on without"
+        out.append(Event(t_ns, "ACCEL_LOST", pt.name, text, (("silent_s", seconds),), begin, t_ns))
 
-    def _change_model(self, p: int, b: F64, var: F64, q: F64 | float, qb: float) -> None:
+    def _resume(self, p: int, out: Out) -> None:
+        """Accelerations that have come steadily for a while drive the prediction from the anchor on."""
+        pt = self.points[p]
+        s = self.settings
+        t_ns = pt.anchor_ns
+        if pt.run_ns < 0 or t_ns - pt.run_ns < int(s.accel_settle_s * S) or not self.ring.covers(p, t_ns):
+            return
+        usual = self.feed.vibration(p, t_ns, s.accel_settle_s)
+        if usual is None:
+            return
+        mean, var, tau = usual
+        q, qb = s.accel_noise_m2ps3, s.bias_walk_m2ps5
+        known = self.known[p]
+        if known is not None and bool(known["aided"]):
+            q, qb = known["q"], known["qb"]
+        self._change_model(p, mean, var + 0.05**2, q, qb)
+        # The velocity of a vibration that fixes alone may have taken for noise.
+        self.C[V, V, p] += 4.0 * var * tau * tau
+        self.q_least[p] = 0.0
+        pt.aided = True
+        self._place(p, t_ns)
+        self._rebase(p, t_ns)
+        out.append(Event(t_ns, "ACCEL_ON", pt.name, "accelerations are there: fusion goes on with them"))
+
+    def _change_model(self, p: int, b: F64, var: F64, q: F64 | float, qb: F64 | float) -> None:
         pt = self.points[p]
         self.x[B, p] = b
         self.C[B, :, p] = 0.0
@@ -606,9 +670,11 @@ class Station:
         if gate.open:
             logs = sum(math.log(a / b) for a, b in zip(S1.tolist(), dd.tolist(), strict=True))
             evidence = 0.5 * (sum(chi) + logs - sum(chi0))
+        # Without accelerations a sudden motion looks like a small jump.
+        follow = (bool(pt.gaps) or not pt.aided) and sum(chi) <= FOLLOW * self.limit
         action = gate.judge(
             t, fits, fits_zero, evidence, _three(level), _three(R), _three(C[V, V]), self.limit, need,
-            t - pt.used_ns, int(s.reacquire_s * S), int(s.lockout_s * S),
+            t - pt.used_ns, int(s.reacquire_s * S), int(s.lockout_s * S), follow,
         )  # fmt: skip
         if action == Action.USE:
             return Verdict.ACCEPTED, True
@@ -619,6 +685,10 @@ class Station:
         if action == Action.OFFSET:
             return Verdict.OFFSET, False
         self.bank.fresh[p] = True
+        if action == Action.FOLLOW:
+            C[D, D] += nu * nu
+            C[V, V] += nu * nu * (1.0 / (dt * dt))
+            return Verdict.OFFSET if gate.open else Verdict.ACCEPTED, False
         values = tuple((f"offset_{a}_m", float(v)) for a, v in zip("xyz", gate.level, strict=True))
         was_floating = pt.floating
         if was_floating:
@@ -731,18 +801,24 @@ class Station:
         self.bank_s2[k] = self.bank_s2[k] + self.bank_s1[k] * np.array(dt)[:, None] + s2
         self.bank_s1[k] = self.bank_s1[k] + s1
         due: list[int] = []
-        u = nu * nu > CHI1_MEDIAN * S_
+        steps: list[float] = []
         for i, p in enumerate(points):
             pt = self.points[p]
             pt.since_bank += dt[i]
             if pt.gaps:
                 self.bank.fresh[p] = True
+            pt.fixes += learn[i]
+            # The receiver is what it was while the prediction is wide on purpose.
+            held = pt.gaps or float(self.q_least[p, 0]) > 0.0
+            steps.append(1.0 if held else 1.0 + s.r_step * max(1.0, 50.0 / (pt.fixes + 10)))
+        step = np.array(steps)[:, None]
+        scale = self.scale[k] * np.where(nu * nu > CHI1_MEDIAN * S_, step, 1.0 / step)
+        scale = np.minimum(np.maximum(scale, s.r_least), s.r_most)
+        self.scale[k] = scale if all(learn) else np.where(np.array(learn)[:, None], scale, self.scale[k])
+        for i, p in enumerate(points):
+            pt = self.points[p]
             if not learn[i]:
                 continue
-            pt.fixes += 1
-            step = 1.0 + s.r_step * max(1.0, 50.0 / (pt.fixes + 10))
-            scale = self.scale[p] * np.where(u[i], step, 1.0 / step)
-            self.scale[p] = np.minimum(np.maximum(scale, s.r_least), s.r_most)
             if self.bank.fresh[p]:
                 if not pt.gaps:
                     x = self.x[:, p]
@@ -766,14 +842,22 @@ class Station:
                     pt.posterior_ns = pt.anchor_ns
                     self._noise(p, R0 * self.scale[p], 1e9 if young else 0.1 * since / S)
 
-    def _contradiction(self, p: int, fix: Measurement, dt: float, z: F64, R: F64, nu: F64, S_: F64, out: Out) -> None:
-        pt = self.points[p]
-        if self.monitor.fix(p, dt, z, R, nu, S_, 2.0 * self.limit):
+    def _contradiction(
+        self, points: list[int], fix: Measurement, dt: list[float], z: F64, R: F64, nu: F64, S_: F64, out: Out
+    ) -> None:
+        rows = [i for i, p in enumerate(points) if self.points[p].aided]
+        if not rows:
+            return
+        if len(rows) < len(points):
+            points, dt = [points[i] for i in rows], [dt[i] for i in rows]
+            R, nu, S_ = R[rows], nu[rows], S_[rows]
+        for p in self.monitor.fix(points, dt, z, R, nu, S_, 2.0 * self.limit):
             if self.monitor.alarm[p]:
                 text = "without the accelerometer the fixes are predicted better: the two do not see the same motion"
-                out.append(Event(fix.t_ns, "CONTRADICTION", pt.name, text))
+                out.append(Event(fix.t_ns, "CONTRADICTION", self.points[p].name, text))
             else:
-                out.append(Event(fix.t_ns, "CONTRADICTION_END", pt.name, "accelerations and fixes agree again"))
+                text = "accelerations and fixes agree again"
+                out.append(Event(fix.t_ns, "CONTRADICTION_END", self.points[p].name, text))
 
     def _bank_done(self, p: int) -> None:
         self.points[p].since_bank = 0.0
@@ -788,14 +872,15 @@ class Station:
         w = 1.0 / (math.log(10.0) * s.accel_noise_decades) ** 2
         wb = 1.0 / (math.log(10.0) * s.bias_walk_decades) ** 2
         q0, qb0 = (s.accel_noise_m2ps3, s.bias_walk_m2ps5) if pt.aided else (s.gnss_only_q_m2ps3, s.gnss_only_qb_m2ps5)
+        least = self.q_least[p].tolist()
         known = self.known[p]
         prior = []
         for axis in range(3):
-            a, b = (q0, qb0)
+            a, b, sure = q0, qb0, 1.0
             if known is not None and bool(known["aided"]) == pt.aided:
-                a, b = float(known["q"][axis]), float(known["qb"][axis])
+                a, b, sure = float(known["q"][axis]), float(known["qb"][axis]), KNOWN
             r = float(R[axis])
-            prior.append((math.log(a / r), w, math.log(b / r), wb))
+            prior.append((math.log(max(a, least[axis]) / r), w * sure, math.log(b / r), wb * sure))
         best = []
         for axis, (rho, beta, _, member) in enumerate(self.bank.posterior(p, prior)):
             r = float(R[axis])
@@ -803,6 +888,7 @@ class Station:
                 old = math.log(float(figure[p, axis]))
                 new = target + math.log(r)
                 figure[p, axis] = math.exp(old + min(max(new - old, -step), step))
+            self.q[p, axis] = max(float(self.q[p, axis]), least[axis])
             best.append(member)
         return best
 
@@ -836,42 +922,62 @@ class Station:
             rows = np.minimum(np.array(first)[:, None] + np.arange(n), last[:, None])
             pp = np.array(alive)[:, None]
             t, g, kind = ring.t[pp, rows], ring.g[pp, rows], ring.kind[pp, rows]
-        anchor = np.array([self.points[p].anchor_ns for p in alive])
-        y, var = live.stream(t, g, anchor, self.x[:, k], self.C[:, :, k], self.g[k], self.q[k], self.qb[k])
+        pts = [self.points[p] for p in alive]
+        anchor = np.array([pt.anchor_ns for pt in pts])
+        y = live.stream(t, g, anchor, self.x[:, k], self.C[:, :, k], self.g[k], self.q[k], self.qb[k])
+        sd = y[6:]
+        for i, pt in enumerate(pts):
+            if pt.gaps:
+                live.add_gaps(pt.gaps, int(anchor[i]), t[i], sd[:, i].T)
+        np.maximum(sd, 0.0, out=sd)
+        np.sqrt(sd, out=sd)
+        worst = sd[:3].max(axis=2).T.tolist()
+        synthetic = bool(np.count_nonzero(kind))
+        modes = np.empty((len(alive), 2, n), dtype=np.uint8)
+        ends = t[:, -1].tolist()
         for i, p in enumerate(alive):
-            if self.points[p].gaps:
-                live.add_gaps(self.points[p].gaps, int(anchor[i]), t[i], var[i])
-        np.maximum(var, 0.0, out=var)
-        sd = np.sqrt(var)
-        worst = sd[:, :, :3].max(axis=1).tolist()
-        synthetic = bool(kind.any())
-        for i, p in enumerate(alive):
-            pt = self.points[p]
+            pt = pts[i]
             c = length[i]
-            mode, flags = self._modes(pt, t[i, :c], sd[i, :c], worst[i], self.monitor.alarm[p])
-            piece = (t[i, :c].copy(), y[i, :c], sd[i, :c], mode, flags)
+            mode, flags, usual = self._usual(pt)
+            modes[i, 0] = mode
+            modes[i, 1] = flags
+            usual = usual and self._within(pt, ends[i], worst[i]) and not self.monitor.alarm[p]
+            if not usual:
+                self._modes(pt, t[i, :c], sd[:, i, :c].T, worst[i], self.monitor.alarm[p], modes[i, :, :c])
+            piece = (t[i, :c].copy(), y[:, i, :c], modes[i, :, :c])
             if synthetic:
                 real = kind[i, :c] != SYNTHETIC
-                piece = (piece[0][real], piece[1][real], piece[2][real], piece[3][real], piece[4][real])
+                piece = (piece[0][real], piece[1][:, real], piece[2][:, real])
             if len(piece[0]):
-                self._mode_events(pt, piece[0], piece[3], out)
+                if not usual or mode != pt.mode:
+                    self._mode_events(pt, piece[0], piece[2][0], out)
                 pieces.setdefault(p, []).append(piece)
 
-    def _modes(self, pt: Point, t: I64, sd: F64, worst: list[float], contradicts: bool) -> tuple[U8, U8]:
-        """Mode and flags of rows t with sd (n, 6); `worst` = the largest sd of displacement per axis."""
+    @staticmethod
+    def _usual(pt: Point) -> tuple[int, int, bool]:
+        """Mode and flags of a point without regard to time and sd, and whether no gap changes them."""
+        flags = (FLOAT if pt.floating else 0) | (JUMP_OPEN if pt.gate.open else 0) | (UNCERTAIN if pt.uncertain else 0)
+        return ACCEL_ONLY if pt.receiver is None else FUSED, flags, not pt.gaps
+
+    def _within(self, pt: Point, end_ns: int, worst: list[float]) -> bool:
+        """Whether nothing up to `end_ns` is old or uncertain enough to change the mode."""
         s = self.settings
-        base = Mode.ACCEL_ONLY if pt.receiver is None else Mode.FUSED
-        mode = np.full(len(t), base, dtype=np.uint8)
-        flag = (
-            (FusionFlag.FLOAT if pt.floating else 0)
-            | (FusionFlag.JUMP_OPEN if pt.gate.open else 0)
-            | (FusionFlag.TIME_UNCERTAIN if pt.uncertain else 0)
+        return pt.receiver is None or (
+            end_ns - pt.used_ns <= self.quiet_ns
+            and worst[0] <= s.invalid_std_horizontal_m
+            and worst[1] <= s.invalid_std_horizontal_m
+            and worst[2] <= s.invalid_std_vertical_m
         )
-        flags = np.full(len(t), flag, dtype=np.uint8)
+
+    def _modes(self, pt: Point, t: I64, sd: F64, worst: list[float], contradicts: bool, modes: U8) -> None:
+        """Mode and flags (2, n), in place, of rows t with sd (n, 6) that are not the usual ones; `worst` = the largest
+        sd of displacement per axis."""
+        s = self.settings
+        mode, flags = modes
         for g in pt.gaps:
             flags[(t >= g.begin_ns) & (t > pt.anchor_ns)] |= np.uint8(FusionFlag.ACCEL_GAP)
         if pt.receiver is None:
-            return mode, flags
+            return
         if int(t[-1]) - pt.used_ns > int(s.coast_s * S):
             coast = t - pt.used_ns > int(s.coast_s * S)
             mode[coast] = Mode.COAST
@@ -883,7 +989,6 @@ class Station:
         if max(worst[:2]) > s.invalid_std_horizontal_m or worst[2] > s.invalid_std_vertical_m:
             bad = (sd[:, :2] > s.invalid_std_horizontal_m).any(axis=1) | (sd[:, 2] > s.invalid_std_vertical_m)
             mode[bad] = Mode.INVALID
-        return mode, flags
 
     def _mode_events(self, pt: Point, t: I64, mode: U8, out: Out) -> None:
         if int(mode[0]) == pt.mode and int(mode[-1]) == pt.mode and not (mode != pt.mode).any():
@@ -894,45 +999,48 @@ class Station:
             out.append(Event(int(t[i]), "MODE", pt.name, text, (("from", float(pt.mode)), ("to", float(new)))))
             pt.mode = new
 
-    def _estimate(self, p: int, parts: list[Piece]) -> Estimate:
-        t, y, sd, mode, flags = parts[0]
+    def _slow(self) -> tuple[F64, F64, F64, F64]:
+        """Bias and level offset of all points with their sd, (P, 3) each."""
+        return self.x[B] + self.ring.reference, np.sqrt(self.C[B, B]), self.x[O].copy(), np.sqrt(self.C[O, O])
+
+    def _estimate(self, p: int, parts: list[Piece], slow: tuple[F64, F64, F64, F64]) -> Estimate:
+        t, y, modes = parts[0]
         if len(parts) > 1:
             t = np.concatenate([a[0] for a in parts])
-            y = np.concatenate([a[1] for a in parts])
-            sd = np.concatenate([a[2] for a in parts])
-            mode = np.concatenate([a[3] for a in parts])
-            flags = np.concatenate([a[4] for a in parts])
-        root = np.sqrt(self.C[_BO, _BO, p])
+            y = np.concatenate([a[1] for a in parts], axis=1)
+            modes = np.concatenate([a[2] for a in parts], axis=1)
+        bias, bias_sd, offset, offset_sd = slow
         return Estimate(
-            self.points[p].name, t, y[:, :3], y[:, 3:], sd[:, :3], sd[:, 3:], mode, flags,
-            self.x[B, p] + self.ring.reference[p], root[0], self.x[O, p].copy(), root[1],
+            self.points[p].name, t, y[:3].T, y[3:6].T, y[6:9].T, y[9:].T, modes[0], modes[1],
+            bias[p], bias_sd[p], offset[p], offset_sd[p],
         )  # fmt: skip
 
     def _single(self, p: int, t_ns: int, out: Out) -> Estimate:
         """The estimate at a fix of a point without accelerations."""
         pt = self.points[p]
         x, C = self.x[:, p], self.C[:, :, p]
-        sd = np.sqrt(np.concatenate([C[D, D], C[V, V]]))[None]
+        y = np.concatenate([x[D], x[V], np.sqrt(C[D, D]), np.sqrt(C[V, V])])[:, None]
         t = np.array([t_ns])
-        mode, flags = self._modes(pt, t, sd, sd[0, :3].tolist(), False)
-        if mode[0] == Mode.FUSED:
-            mode[0] = Mode.GNSS_ONLY
+        mode, flags, _ = self._usual(pt)
+        modes = np.array([[mode], [flags]], dtype=np.uint8)
+        self._modes(pt, t, y[6:].T, y[6:9, 0].tolist(), False, modes)
+        if modes[0, 0] == Mode.FUSED:
+            modes[0, 0] = Mode.GNSS_ONLY
         if pt.aided:
-            flags[0] |= FusionFlag.ACCEL_GAP
-        self._mode_events(pt, t, mode, out)
-        return self._estimate(p, [(t, np.concatenate([x[D], x[V]])[None], sd, mode, flags)])
+            modes[1, 0] |= FusionFlag.ACCEL_GAP
+        self._mode_events(pt, t, modes[0], out)
+        return self._estimate(p, [(t, y, modes)], self._slow())
 
     # ----------------------------------------------------------------------------------------------------------- state
 
     def slow(self) -> State:
         """What an earlier run knew of the sensors, by point: noise and bias. Absent before the start."""
+        return {pt.name: self._figures(p) for p, pt in enumerate(self.points) if pt.started and pt.receiver is not None}
+
+    def _figures(self, p: int) -> State:
         return {
-            pt.name: {
-                "scale": self.scale[p], "q": self.q[p], "qb": self.qb[p], "aided": pt.aided,
-                "bias": self.x[B, p] + self.ring.reference[p],
-            }
-            for p, pt in enumerate(self.points)
-            if pt.started and pt.receiver is not None
+            "scale": self.scale[p].copy(), "q": self.q[p].copy(), "qb": self.qb[p].copy(),
+            "aided": self.points[p].aided, "bias": self.x[B, p] + self.ring.reference[p],
         }  # fmt: skip
 
     def adopt(self, s: State) -> list[Event]:
@@ -977,14 +1085,7 @@ class Station:
         self.old, self.prechecked = s["counts"]
 
 
-_ARRAYS = ("x", "C", "g", "bent", "bend_rate", "q", "qb", "scale", "bank_s1", "bank_s2")
-_BO = np.array([B, O])
-
-
-def _diagonal(v: F64) -> F64:
-    out = np.zeros((3, 3))
-    out.reshape(9)[::4] = v
-    return out
+_ARRAYS = ("x", "C", "g", "bent", "bend_rate", "q", "qb", "q_least", "scale", "bank_s1", "bank_s2")
 
 
 def _three(v: F64) -> Three:

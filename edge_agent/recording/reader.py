@@ -234,6 +234,53 @@ def _messages(buffer: Buffer, known: Channels, wanted: Container[str] | None) ->
             return
 
 
+def read_between(path: Path, begin_ns: int, end_ns: int) -> Iterator[Stored]:
+    """Messages with `begin_ns` <= log time < `end_ns` of a file in which log time does not step back; only the chunks
+    that hold them are unpacked, and those before them where they may define a channel. Errors as `read_messages`."""
+    with view(Path(path)) as buffer:
+        _check_magic(buffer, path)
+        known = Channels()
+        skipped: list[ChunkHead] = []
+        for part in parts(buffer):
+            if part.opcode != CHUNK:
+                continue
+            head = chunk_head(buffer, part)
+            if head.start_ns >= end_ns:
+                return
+            if head.end_ns < begin_ns:
+                skipped.append(head)
+                continue
+            try:
+                data = chunk_data(buffer, head)
+            except DamagedError:
+                if next(parts(buffer, part.pos + part.length), None) is None:
+                    return
+                raise
+            for before in skipped:
+                _define(chunk_data(buffer, before), known)
+            skipped.clear()
+            for inner in parts(data, 0):
+                if inner.opcode in (SCHEMA, CHANNEL):
+                    known.meet(data, inner)
+                elif inner.opcode == MESSAGE:
+                    stored = known.message(data, inner)
+                    if begin_ns <= stored.log_ns < end_ns:
+                        yield stored
+
+
+def _define(data: bytes, known: Channels) -> None:
+    for part in parts(data, 0):
+        if part.opcode in (SCHEMA, CHANNEL):
+            known.meet(data, part)
+
+
+def newest_ns(path: Path) -> int:
+    """The largest log time of a file by the heads of its chunks; 0 = none. Errors as `read_messages`."""
+    with view(Path(path)) as buffer:
+        _check_magic(buffer, path)
+        return max((chunk_head(buffer, part).end_ns for part in parts(buffer) if part.opcode == CHUNK), default=0)
+
+
 class Attachment(NamedTuple):
     name: str
     media_type: str
@@ -268,6 +315,21 @@ def read_metadata(path: Path) -> dict[str, dict[str, str]]:
         _check_magic(buffer, path)
         found = [parse_metadata(buffer, part) for part in parts(buffer) if part.opcode == METADATA]
     return dict(found)
+
+
+def head_metadata(path: Path, name: str) -> dict[str, str]:
+    """The first metadata record of a name, without a walk through the whole file; {} where it does not stand in front
+    of the first chunk. Raises OSError, DamagedError."""
+    with view(Path(path)) as buffer:
+        _check_magic(buffer, path)
+        for part in parts(buffer):
+            if part.opcode == CHUNK:
+                break
+            if part.opcode == METADATA:
+                found, values = parse_metadata(buffer, part)
+                if found == name:
+                    return values
+    return {}
 
 
 def parse_metadata(buffer: Buffer, part: Part) -> tuple[str, dict[str, str]]:

@@ -70,6 +70,7 @@ COPY = ".repairing"
 _ZSTD = struct.pack("<I", 4) + b"zstd"
 _BEFORE_ZSTD = 9 + 28  # record head, times, size and CRC stand before a chunk's compression
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
+_MESSAGE_HEAD = 9 + 22  # record head, channel, sequence, log time, publish time
 
 
 class Repaired(NamedTuple):
@@ -200,8 +201,7 @@ def _young_are_whole(buffer: Buffer, scan: _Scan) -> bool:
     try:
         for piece, head in chunks:
             if head.end_ns >= last - YOUNG_NS:
-                reader.chunk_data(buffer, head)
-                _check_entries(buffer, piece, head)
+                _check_entries(buffer, piece, reader.chunk_data(buffer, head))
     except DamagedError:
         return False
     return True
@@ -217,14 +217,17 @@ def _scan(buffer: Buffer, thorough: bool) -> _Scan:
             if chunk is not None and buffer[pos] == MESSAGE_INDEX:
                 pos = _take_indexes(buffer, chunk, pos)
                 if thorough and chunk.head is not None:
-                    _check_entries(buffer, chunk, chunk.head)
+                    _check_entries(buffer, chunk, reader.chunk_data(buffer, chunk.head))
                 continue
             part = _part(buffer, pos or len(MAGIC))
             end = part.pos + part.length
             if part.opcode == DATA_END and pos:
+                whole = _is_complete(buffer, pos)
+                if not whole and _next_chunk(buffer, pos + 1) < len(buffer):
+                    raise DamagedError(f"an end of data at byte {pos} with more data behind it")
                 if chunk is not None:
                     _settle(scan, chunk, buffer)
-                scan.complete = not scan.damage and _is_complete(buffer, pos)
+                scan.complete = not scan.damage and whole
                 if not scan.complete:
                     scan.damage.append((pos, len(buffer)))
                     scan.reason = scan.reason or "index or footer not whole"
@@ -256,8 +259,11 @@ def _piece(buffer: Buffer, part: Part, pos: int, thorough: bool) -> _Piece:
     """The record at `pos`. DamagedError for anything that does not belong there."""
     piece = _Piece(part, part.pos + part.length)
     if pos == 0:
-        if buffer[: len(MAGIC)] != MAGIC or part.opcode != HEADER or reader.parse_header(buffer, part)[0] != PROFILE:
+        if buffer[: len(MAGIC)] != MAGIC or part.opcode != HEADER:
             raise DamagedError("the file does not begin as a recording")
+        profile, library = reader.parse_header(buffer, part)
+        if profile != PROFILE or part.length != 8 + len(profile.encode()) + len(library.encode()):
+            raise DamagedError("the file does not begin as a recording of this program")
     elif part.opcode == CHUNK:
         piece.head = reader.chunk_head(buffer, part)
         if thorough:
@@ -294,21 +300,37 @@ def _take_indexes(buffer: Buffer, chunk: _Piece, pos: int) -> int:
     return pos
 
 
-def _check_entries(buffer: Buffer, chunk: _Piece, head: ChunkHead) -> None:
-    """DamagedError where an index entry does not fit its chunk."""
-    for pos, count in chunk.index.values():
-        if pos >= 0:
-            entries = np.frombuffer(buffer, "<u8", 2 * count, pos + _INDEX.size)
-            times = entries[0::2]
-            if times.min() < head.start_ns or times.max() > head.end_ns or entries[1::2].max() >= head.size:
-                raise DamagedError(f"message index at byte {pos}: does not fit its chunk")
+def _check_entries(buffer: Buffer, chunk: _Piece, data: bytes) -> None:
+    """DamagedError where an index entry is not that of a message in the chunk's `data`."""
+    inside = np.frombuffer(data, np.uint8)
+    for channel, (pos, count) in chunk.index.items():
+        if pos < 0:
+            continue
+        entries = np.frombuffer(buffer, "<u8", 2 * count, pos + _INDEX.size)
+        times, at = entries[0::2], entries[1::2]
+        good = bool(at.max() < inside.size - _MESSAGE_HEAD)
+        if good:
+            head = inside[at[:, None].astype(np.int64) + np.arange(_MESSAGE_HEAD)]
+            good = (
+                bool((head[:, 0] == MESSAGE).all())
+                and bool((head[:, 9:11].copy().view("<u2")[:, 0] == channel).all())
+                and bool((head[:, 15:23].copy().view("<u8")[:, 0] == times).all())
+            )
+        if not good:
+            raise DamagedError(f"message index at byte {pos}: does not fit its chunk")
 
 
 def _settle(scan: _Scan, chunk: _Piece, buffer: Buffer) -> None:
     """Take the channels of a chunk whose indexes are known; a chunk whose channels are lost becomes damage."""
     try:
         if not chunk.index or any(channel not in scan.known.channels for channel in chunk.index):
-            _read_chunk(scan.known, _data(buffer, chunk))
+            there = {
+                channel: (-1, len(times)) for channel, times in _read_chunk(scan.known, _data(buffer, chunk)).items()
+            }
+            if there.keys() != chunk.index.keys():  # the index is damaged, not the chunk
+                scan.damage += [(chunk.record_end, chunk.end)] if chunk.end > chunk.record_end else []
+                scan.reason = scan.reason or f"message indexes at byte {chunk.record_end} do not fit their chunk"
+                chunk.index, chunk.end = there, chunk.record_end
         for channel in chunk.index:
             topic, schema = scan.known.channels[channel]
             if schema and schema not in scan.known.schemas:

@@ -185,6 +185,8 @@ float32 vdop
 float32 pdop
 float32 age_s            # of the corrections
 float32 baseline_m
+float32 course_deg       # over ground, clockwise from true north, of VTG
+float32 speed_mps        # over ground
 uint16 satellites
 bool date_known          # the date came from the receiver
 {_QUALITY}uint8 fix
@@ -264,11 +266,15 @@ float32[9] variance_m2                    # of the residual, row by row
 float32 ratio                             # v' S^-1 v / chi2(0.999): fits when <= 1
 {_VERDICT}uint8 verdict
 """,
-    "edge_agent_msgs/msg/Heading": f"""# Heading of a receiver with two antennas.
-std_msgs/Header header
+    "edge_agent_msgs/msg/Heading": f"""# Heading of a receiver with two antennas: azimuth from the first to the second.
+std_msgs/Header header   # stamp: when it was true
 int64 monotonic_ns
-float64 heading_deg      # clockwise from true north
+float64 heading_deg      # filtered, clockwise from true north, 0 to 360; NaN before its start
+float64 measured_deg     # as the receiver said; NaN = not valid
 float32 std_deg
+float32 std_measured_deg # as used
+float32 tilt_deg         # as the receiver said: second antenna above the first
+float32 baseline_m       # as the receiver said: between the antennas
 float32 ratio            # of the gate: fits when <= 1
 {_VERDICT}uint8 verdict
 """,

@@ -24,8 +24,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edge_agent.messages import Fault, Record, RecordSettings, Rotate, S
+from edge_agent.recording.reader import DamagedError, head_metadata
 from edge_agent.recording.repair import DAMAGED, Repaired, recover, repair
-from edge_agent.recording.writer import PART, SegmentWriter, fsync_folder
+from edge_agent.recording.writer import PART, RUN_METADATA, SegmentWriter, fsync_folder
 
 __all__ = ["Recorder", "RecordingError", "Repaired", "Segment", "list_segments", "recover"]
 
@@ -34,6 +35,8 @@ PLAUSIBLE = datetime(2020, 1, 1, tzinfo=UTC)
 """Names before this come from a gateway whose clock had not been set; their age is not known."""
 HEAD_BYTES = 1 << 20
 """Free space without which no file is begun: head, checkpoint and an index."""
+RECENT = 1000
+"""Files of this run whose names are kept for event clips; an hour of them where a file lasts four seconds."""
 RETENTION_NS = 60 * S
 """How often retention looks at the folder while a file is open: other programs fill disks too."""
 
@@ -97,6 +100,7 @@ class Recorder:
         self.attachments = dict(attachments)
         self.free_bytes = free_bytes
         self.segments = 0  # opened by this run
+        self.recent: tuple[Path, ...] = ()  # final names of this run's latest files, the open one last
         self._writer: SegmentWriter | None = None
         self._previous: tuple[str, str] | None = None  # name and SHA-256 of the file before; ("", "") = none
         self._faults: list[Fault] = []
@@ -134,6 +138,13 @@ class Recorder:
             self._writer.add(item)
         except OSError as e:
             raise self._fail(e) from e
+
+    def wait_s(self, now_ns: int) -> float:
+        """Seconds until `idle` has to flush, at most 1: time that the disk took counts, or a kill would cost more."""
+        if self._writer is None:
+            return min(self.settings.flush_s, 1.0)
+        due_s = (self._flushed_ns - now_ns) / S + self.settings.flush_s
+        return min(max(due_s, 0.0), 1.0)
 
     def idle(self, now_ns: int) -> None:
         """Do what is due: flush every `flush_s`, fsync every `fsync_s`, retention every minute. RecordingError."""
@@ -188,7 +199,9 @@ class Recorder:
             text = f"no segment can be opened: {e}"
             raise RecordingError(_reason(e), text, (*lost, rotate.checkpoint)) from e
         self.segments += 1
-        self._flushed_ns = self._synced_ns = self._now_ns
+        self.recent = (*self.recent[-RECENT + 1 :], self._writer.final)
+        # What comes behind a Rotate has waited with it since the last flush: it has no further `flush_s` to wait.
+        self._synced_ns = self._flushed_ns
         if unfinished:
             raise RecordingError(unfinished.reason, f"{unfinished}; a new segment is open", lost) from unfinished
 
@@ -233,8 +246,12 @@ class Recorder:
         finished = [s for s in list_segments(self.data_dir, self.site) if s.path.suffix == ".mcap"]
         if not finished:
             return "", ""
-        with open(finished[-1].path, "rb") as file:
-            return finished[-1].path.name, hashlib.file_digest(file, "sha256").hexdigest()
+        last = finished[-1]
+        if last.begin > self._utc:  # a clock was ahead then: the newest is the one that no other file names
+            named = {_previous_name(s.path) for s in finished}
+            last = next((s for s in reversed(finished) if s.path.name not in named), last)
+        with open(last.path, "rb") as file:
+            return last.path.name, hashlib.file_digest(file, "sha256").hexdigest()
 
     # ------------------------------------------------------------------------------------------------------ retention
 
@@ -294,6 +311,14 @@ class Recorder:
             return f"{repair(part).path.name} was sealed"
         except OSError as e:
             return f"{part.name} waits for repair ({e.strerror or e})"
+
+
+def _previous_name(path: Path) -> str:
+    """The file that a recording follows; "" where it does not say. OSError."""
+    try:
+        return head_metadata(path, RUN_METADATA).get("previous_name", "")
+    except DamagedError:
+        return ""
 
 
 def _reason(error: OSError) -> str:

@@ -24,6 +24,7 @@ from edge_agent.messages import (
     CanFrames,
     Estimate,
     GnssFix,
+    HeadingEstimate,
     Innovation,
     Quality,
     Raw,
@@ -95,13 +96,13 @@ _RAW_BYTES = struct.Struct("<QQ")
 _CAN_FRAMES = struct.Struct("<QQqIIB3x")
 _TICK = struct.Struct("<QQqq?")
 _CHECKPOINT = struct.Struct("<QQq")
-_SOLUTION = struct.Struct("<qqqqddddddd3f3ffffffH?B")
+_SOLUTION = struct.Struct("<qqqqddddddd3f3ffffffffH?B")
 _ACCEL = struct.Struct("<q3fB")
 _ACCEL_BLOCK = struct.Struct("<q?3x")
 _FUSED_STATE = struct.Struct("<q3f3f3f3f3f3fBB")
 _FUSED_BLOCK = struct.Struct("<q3f3f3f3fB3x")
 _UPDATE = struct.Struct("<qq3f3f3f3f9ffB")
-_HEADING = struct.Struct("<qdffB")
+_HEADING = struct.Struct("<qdd5fB")
 _EVENT = struct.Struct("<q")
 _I8 = struct.Struct("<b")
 _U16 = struct.Struct("<H")
@@ -239,7 +240,8 @@ def gnss_solution(
     fixed = (
         *(fix.t_ns, fix.arrival_ns, latency_ns, fix.utc_ns),
         *(fix.lat_deg, fix.lon_deg, fix.h_m, fix.separation_m, *enu_m),
-        *_f32((*fix.std_enu_m, *fix.resolution_enu_m, fix.hdop, fix.vdop, fix.pdop, fix.age_s, baseline_m)),
+        *_f32((*fix.std_enu_m, *fix.resolution_enu_m, fix.hdop, fix.vdop, fix.pdop, fix.age_s)),
+        *_f32((baseline_m, fix.course_deg, fix.speed_mps)),
         *(fix.satellites, fix.date_known, fix.quality),
     )
     out = cdr.Out(_head(utc_ns, frame_id), cdr.pack(_SOLUTION, *fixed))
@@ -296,8 +298,8 @@ def fused_block(estimate: Estimate, utc_ns: int, frame_id: str = "structure") ->
     )
     out = cdr.Out(_head(utc_ns, frame_id), cdr.pack(_FUSED_BLOCK, *fixed))
     columns = np.empty((12, len(estimate.t_ns)), "<f4")
-    columns[0:3] = (np.round(estimate.displacement_m * DISPLACEMENT_GRID) / DISPLACEMENT_GRID).T
-    columns[3:6] = (np.round(estimate.velocity_mps * VELOCITY_GRID) / VELOCITY_GRID).T
+    columns[0:3] = (np.rint(estimate.displacement_m * DISPLACEMENT_GRID) * (1.0 / DISPLACEMENT_GRID)).T
+    columns[3:6] = (np.rint(estimate.velocity_mps * VELOCITY_GRID) * (1.0 / VELOCITY_GRID)).T
     columns[6:9] = estimate.std_displacement_m.T
     columns[9:12] = estimate.std_velocity_mps.T
     bits = columns[6:12].view("<u4")  # 10 bits of mantissa, 0.05 %: nobody knows a standard deviation better
@@ -328,11 +330,11 @@ def fusion_update(innovation: Innovation, utc_ns: int, frame_id: str = "structur
     return _head(utc_ns, frame_id) + cdr.pack(_UPDATE, *fixed)
 
 
-def heading(
-    heading_deg: float, std_deg: float, ratio: float, verdict: int, t_ns: int, utc_ns: int, frame_id: str = "map"
-) -> bytes:
-    """Heading, clockwise from true north."""
-    return _head(utc_ns, frame_id) + cdr.pack(_HEADING, t_ns, heading_deg, std_deg, ratio, verdict)
+def heading(h: HeadingEstimate, utc_ns: int, frame_id: str = "map") -> bytes:
+    """Heading; `utc_ns` is when it was true."""
+    floats = _f32((h.std_deg, h.std_measured_deg, h.tilt_deg, h.baseline_m, h.ratio))
+    fixed = (h.t_ns, h.heading_deg, h.measured_deg, *floats, h.verdict)
+    return _head(utc_ns, frame_id) + cdr.pack(_HEADING, *fixed)
 
 
 def event(

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from drivers import PortError, can_port
-from drivers.can_port import CanPort, FrameBus, FrameSocket, monotonic_stamps, unpack_frames
+from drivers.can_port import CanPort, FrameBus, FrameSerial, FrameSocket, monotonic_stamps, unpack_frames
 from drivers.clock_port import clock_pair
 from drivers.dbc_codec import AccelCodec
 from edge_agent.messages import MS, AccelerometerSettings, CanFlag, CanFrames, PortSettings, S
@@ -561,14 +561,56 @@ def test_slcan_frames_of_every_kind() -> None:
     with Adapter(lines) as adapter:
         port = slcan_port(adapter)
         port.open()
-        got = gather(port, 5)
+        got = gather(port, 4)
         port.close()
     assert b"S6\r" in adapter.commands
-    assert got.can_id.tolist() == [0x123, 0x18FF3408, 0x7FF, 0x124, 0x007]
-    expected = [CanFlag(0), CanFlag.EXT, CanFlag.RTR, CanFlag(0), CanFlag(0)]
+    assert got.can_id.tolist() == [0x123, 0x18FF3408, 0x7FF, 0x007]
+    expected = [CanFlag(0), CanFlag.EXT, CanFlag.RTR, CanFlag(0)]
     assert got.flags.tolist() == [int(f | CanFlag.DRAIN) for f in expected]
-    assert got.length.tolist() == [2, 8, 4, 2, 0]  # the cut frame holds what came of it
-    assert port.counters["malformed"] == 1
+    assert got.length.tolist() == [2, 8, 4, 0]
+    assert port.counters["malformed"] == 2  # a wrong digit, and a frame that was cut
+
+
+class Reads:
+    """A serial port that gives these pieces, and then nothing."""
+
+    timeout: float | None = 1.0
+
+    def __init__(self, *pieces: bytes) -> None:
+        self.pieces = list(pieces)
+
+    def read(self, size: int) -> bytes:
+        return self.pieces.pop(0) if self.pieces else b""
+
+
+def test_a_frame_has_the_time_of_the_read_that_completed_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(1000, 9000, 1000))
+    monkeypatch.setattr(can_port.time, "monotonic_ns", lambda: next(clock))
+    port = Reads(b"t1230\rt12", b"40\rt1250\r", b"t1", b"", b"260\r")
+    source = FrameSerial(port, counters())
+    assert port.timeout == 0.0
+    source.drain()
+    first = source.block()
+    source.drain()
+    second = source.block()
+    assert first is not None
+    assert second is not None
+    assert (first.can_id.tolist(), first.t_ns.tolist()) == ([0x123, 0x124, 0x125], [1000, 2000, 2000])
+    assert (second.can_id.tolist(), second.t_ns.tolist()) == ([0x126], [4000])
+    assert source.block() is None
+
+
+def test_garbage_on_the_adapters_line_is_counted_and_the_port_goes_on() -> None:
+    """Bytes that are no text at all, a flood without an end of line, frames run into one another."""
+    lines = [b"t1231AA\r", b"\xff\xfe\x00\r", b"\x80" * 5000, b"t1241BB\r", b"t12", b"t1251CC\r", b"z\rZ\rV1013\r\a\r"]
+    with Adapter([*lines, b"t1261DD\r"]) as adapter:
+        port = slcan_port(adapter)
+        port.open()
+        got = gather(port, 4)
+        port.close()
+    assert got.can_id.tolist() == [0x123, 0x124, 0x125, 0x126]
+    assert got.data[:, 0].tolist() == [0xAA, 0xBB, 0xCC, 0xDD]
+    assert port.counters["malformed"] >= 3
 
 
 def test_an_adapter_that_is_pulled_out_is_a_lost_port() -> None:

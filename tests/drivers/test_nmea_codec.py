@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 
 from drivers.binary_frames import FRAME_LIMIT
 from drivers.nmea_codec import NmeaCodec
-from edge_agent.messages import Event, GnssFix, Quality, Reject, S
+from edge_agent.messages import Event, GnssFix, GnssHeading, Quality, Reject, S
 from edge_agent.state import pack, unpack
 
 DAY = 86400 * S
-Out = list[GnssFix | Reject | Event]
+Out = list[GnssFix | GnssHeading | Reject | Event]
 
 
 def sentence(body: str, end: str = "\r\n") -> bytes:
@@ -64,6 +64,41 @@ def zda(time: str = "084706.30", date: str = "24,11,2026") -> bytes:
     return sentence(f"GPZDA,{time},{date},00,00")
 
 
+def ggk(
+    time: str = "084706.30",
+    quality: str = "3",
+    *,
+    date: str = "112426",
+    lat: str = "5102.0327346,N",
+    lon: str = "01344.3752461,E",
+    height: str = "EHT160.4522",
+) -> bytes:
+    return sentence(f"PTNL,GGK,{time},{date},{lat},{lon},{quality},14,1.9,{height},M")
+
+
+def vtg(course: str = "211.50", knots: str = "0.034", kmh: str = "0.063", mode: str = "D") -> bytes:
+    return sentence(f"GNVTG,{course},T,,M,{knots},N,{kmh},K,{mode}")
+
+
+def hdt(deg: str = "274.12", label: str = "T") -> bytes:
+    return sentence(f"GPHDT,{deg},{label}")
+
+
+def ths(deg: str = "244.28", mode: str = "A") -> bytes:
+    return sentence(f"GNTHS,{deg},{mode}")
+
+
+def avr(
+    time: str = "084706.30",
+    yaw: str = "+52.1531",
+    quality: str = "3",
+    *,
+    tilt: str = "-0.0806,Tilt,,",
+    baseline: str = "12.575",
+) -> bytes:
+    return sentence(f"PTNL,AVR,{time},{yaw},Yaw,{tilt},{baseline},{quality},1.4,16")
+
+
 def utc(text: str) -> int:
     """ns of "2026-11-24 08:47:06.3"."""
     day, clock = text.split(" ")
@@ -85,6 +120,10 @@ def feed(
 
 def fixes(out: Out) -> list[GnssFix]:
     return [x for x in out if isinstance(x, GnssFix)]
+
+
+def headings(out: Out) -> list[GnssHeading]:
+    return [x for x in out if isinstance(x, GnssHeading)]
 
 
 def rejects(out: Out) -> list[Reject]:
@@ -550,7 +589,7 @@ REJECTS = [
     ("FIELD", gga(lat="-5102.03,N"), "angle"),
     ("FIELD", gga(lat="5102.03,E"), "hemisphere 'E'; N or S"),
     ("FIELD", gga(lat="5102.03,"), "hemisphere ''"),
-    ("FIELD", gga(lat=",", lon=","), "quality 4 but no position"),
+    ("FIELD", gga(lat=",", lon=","), "FIXED but no position"),
     ("FIELD", gga(lat=","), "angle ''"),
     ("FIELD", gga(msl="1e2"), "height '1e2'"),
     ("FIELD", gga(msl="nan"), "height 'nan'"),
@@ -575,6 +614,46 @@ REJECTS = [
     ("RANGE", rmc(date="001126"), "date"),
     ("RANGE", zda(date="24,13,2026"), "date 2026-13-24"),
     ("RANGE", gst(alt="-0.1"), "sigma '-0.1'"),
+    ("FIELD", ggk(quality=""), "quality ''"),
+    ("FIELD", ggk(quality="R"), "quality 'R'"),
+    ("FIELD", ggk(date="11242"), "mmddyy"),
+    ("FIELD", ggk(date="1124x6"), "mmddyy"),
+    ("FIELD", ggk(height="160.4522"), "EHT"),
+    ("FIELD", ggk(height="GHT160.4522"), "EHT"),
+    ("FIELD", ggk(height="EHTx"), "height 'x'"),
+    ("FIELD", ggk(lat=",", lon=","), "FIXED but no position"),
+    ("FIELD", ggk(time="084706.3x"), "hhmmss"),
+    ("FIELD", ggk().replace(b",M*", b",F*")[:-4] + b"00\r\n", "M would be right"),
+    ("FIELD", sentence("PTNL,GGK,102939.00,051910"), "GGK has 12"),
+    ("RANGE", ggk(quality="13"), "0 to 12"),
+    ("RANGE", ggk(date="241126"), "date 2026-24-11"),  # ddmmyy, as one manual has it
+    ("RANGE", ggk(height="EHT999999"), "height"),
+    ("LENGTH", sentence("PTNL,GGK,102939.00," + "0" * 120), "120 bytes"),
+    ("FIELD", vtg(course="x"), "course 'x'"),
+    ("FIELD", vtg(mode="d"), "mode 'd'"),
+    ("FIELD", vtg(mode="AA"), "mode 'AA'"),
+    ("FIELD", vtg(kmh="1e3"), "speed '1e3'"),
+    ("FIELD", sentence("GPVTG,054.7,034.4,005.5,010.2"), "VTG has 9"),
+    ("FIELD", sentence("GPVTG,054.7,M,034.4,T,005.5,N,010.2,K"), "T would be right"),
+    ("RANGE", vtg(course="360.01"), "course"),
+    ("RANGE", vtg(knots="-0.1"), "speed"),
+    ("FIELD", hdt("27x"), "heading '27x'"),
+    ("FIELD", hdt(label="M"), "T would be right"),
+    ("RANGE", hdt("-0.1"), "heading '-0.1'"),
+    ("RANGE", hdt("360.1"), "heading '360.1'"),
+    ("FIELD", ths(mode=""), "mode ''"),
+    ("FIELD", ths(mode="D"), "mode 'D'"),
+    ("FIELD", sentence("GNTHS,244.28"), "THS has 2"),
+    ("RANGE", ths("400"), "heading '400'"),
+    ("FIELD", avr(quality=""), "quality ''"),
+    ("FIELD", avr(yaw="52.1531W"), "yaw '52.1531W'"),
+    ("FIELD", avr(tilt="0.1,Yaw,,"), "Tilt would be right"),
+    ("FIELD", sentence("PTNL,AVR,084706.30,+52.1531,Yaw,-0.0806,Tilt,,,12.575"), "AVR has 12"),
+    ("RANGE", avr(yaw="-360.1"), "yaw"),
+    ("RANGE", avr(tilt="-91,Tilt,,"), "tilt"),
+    ("RANGE", avr(quality="99"), "0 to 12"),
+    ("RANGE", avr(baseline="-1"), "range"),
+    ("RANGE", avr(time="250000"), "000000 to 235960"),
     *(
         ("BINARY_CRC", make(b"payload.")[:-2] + b"\x00\x00", "would be right")
         for make in FRAMES.values()
@@ -708,12 +787,12 @@ def test_other_sentences_are_accepted_and_left_alone() -> None:
     bodies = [
         "GNGGAH,130058.00,1",
         "PSSN,SNC,[0,379359000,1840]",
-        "PTNL,GGK,102939.00,051910",
+        "PTNL,LLK,102939.00,051910",
         "GNFOO,",
         "PUBX,03," + "1," * 300,
     ]
     assert feed(*(sentence(b) for b in bodies), codec=codec) == []
-    assert codec.counters["accepted"] == len(bodies)
+    assert codec.counters["accepted"] == codec.counters["not_decoded"] == len(bodies)
     assert codec.last_position_ns == -1
 
 
@@ -784,6 +863,16 @@ POOL = [
     gga("000000.00"),
     sentence("GPGGA,,,,,,0,,,,M,,M,,"),
     sentence("GNGSA,A,3" + "," * 12 + ",1.5,0.9,1.2"),
+    ggk(clock(1)),
+    ggk(clock(2), "0", lat=",", lon=",", height="", date=""),
+    vtg(),
+    vtg(mode="N"),
+    hdt(),
+    hdt(""),
+    ths(),
+    ths(mode="V"),
+    avr(clock(2)),
+    avr(clock(3), quality="0"),
     *(data for _, data, _ in REJECTS),
     *(make(b"ab" + gga(clock(2)) + b"\xb5b\xd3\x00\xaaD") for make in FRAMES.values()),
     b"\r\n",
@@ -857,6 +946,12 @@ def test_a_loaded_state_saves_as_itself() -> None:
     stream = [p for i in range(12) for p in (rmc(clock(i)), gga(clock(i)), *([gst(clock(i))] if i % 4 == 0 else []))]
     stream += [
         POOL[16],
+        hdt(),
+        ths(),
+        hdt(),
+        ggk(clock(11)),
+        ggk(clock(12)),
+        vtg(),
         gns(clock(12)),
         gga(clock(13), separation=""),
         b"#",

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import random
+import socket
+import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import serial
+from serial import rfc2217
 
 import drivers.serial_port
 from drivers import PORTS, PortError, load
@@ -169,12 +173,162 @@ def test_an_impossible_baud_is_said(pty: Pty) -> None:
         SerialPort(PortSettings(name="gnss", kind="serial", device=pty.device, baud=-5)).open()
 
 
-def test_a_url_handler_of_pyserial_works() -> None:
-    port = make("loop://")
+class Server:
+    """A TCP server on the loopback that takes one client after the other."""
+
+    def __init__(self) -> None:
+        self.listening = socket.create_server(("127.0.0.1", 0))
+        self.address = f"127.0.0.1:{self.listening.getsockname()[1]}"
+        self.clients: list[socket.socket] = []
+
+    def accept(self) -> socket.socket:
+        self.clients.append(self.listening.accept()[0])
+        return self.clients[-1]
+
+    def close(self) -> None:
+        for s in (self.listening, *self.clients):
+            s.close()
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    s = Server()
+    yield s
+    s.close()
+
+
+NOISE = bytes(range(256)) * 4 + random.Random(2).randbytes(200_000) + b"\xff\xff\xfa\x00\r\n" * 100
+
+
+def test_a_tcp_server_is_read_in_blocks_to_its_last_byte_and_again(server: Server) -> None:
+    port = make(f"socket://{server.address}")
+    for _ in range(2):
+        port.open()
+        client = server.accept()
+
+        def play(client: socket.socket = client) -> None:
+            client.sendall(NOISE)
+            client.close()
+
+        player = threading.Thread(target=play)
+        player.start()
+        reads = port.counters["reads"]
+        assert collect(port, len(NOISE)) == NOISE
+        assert port.counters["reads"] - reads < len(NOISE) / 100  # pyserial's `in_waiting` says 1: a read of each byte
+        with pytest.raises(PortError, match=rf"lost socket://{server.address}: .*the other end closed"):
+            port.read()
+        player.join()
+        port.close()
+    assert port.counters["opens"] == 2
+
+
+def test_a_silent_tcp_server_is_silence_and_the_kernel_asks_whether_it_lives(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drivers.serial_port, "WAIT_S", 0.01)
+    port = make(f"socket://{server.address}")
     port.open()
-    port._serial.write(b"through the loop")
-    assert collect(port, 16) == b"through the loop"
+    assert port.read() == []
+    with socket.socket(fileno=os.dup(port._fd)) as s:
+        assert s.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        assert s.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == 15
     port.close()
+
+
+def test_a_reset_connection_is_a_lost_device(server: Server) -> None:
+    port = make(f"socket://{server.address}")
+    port.open()
+    client = server.accept()
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    client.close()
+    with pytest.raises(PortError, match="lost socket://"):
+        port.read()
+    port.close()
+
+
+class Rfc2217Server:
+    """A serial server: pyserial's own server side with a port that has every line (a pseudo-terminal has none)."""
+
+    def __init__(self, server: Server) -> None:
+        self.client = server.accept()
+        self.serial = serial.serial_for_url("loop://", 9600)
+        self._lock = threading.Lock()
+        self.manager = rfc2217.PortManager(self.serial, self)
+        self._threads = [threading.Thread(target=self._commands, daemon=True)]
+        self._threads[0].start()
+
+    def write(self, data: bytes) -> None:
+        with self._lock:
+            self.client.sendall(data)
+
+    def _commands(self) -> None:
+        with contextlib.suppress(OSError):
+            while data := self.client.recv(1024):
+                list(self.manager.filter(data))  # a generator
+
+    def send(self, data: bytes) -> None:
+        self.write(b"".join(self.manager.escape(data)))
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):  # the client may have gone first
+            self.client.shutdown(socket.SHUT_RDWR)
+        self.client.close()
+        self._threads[0].join()
+        self.serial.close()
+
+
+# pyserial's handler sets up its thread in a way that Python calls old
+@pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")
+def test_an_rfc2217_server_takes_the_baud_rate_and_loses_nothing(server: Server) -> None:
+    port = SerialPort(PortSettings("gnss", "serial", device=f"rfc2217://{server.address}", baud=38400))
+    made: list[Rfc2217Server] = []
+    host = threading.Thread(target=lambda: made.append(Rfc2217Server(server)))
+    host.start()
+    port.open()
+    host.join()
+    far = made[0]
+    assert far.serial.baudrate == 38400
+    player = threading.Thread(target=lambda: (far.send(NOISE), far.close()))
+    player.start()
+    player.join()
+    assert collect(port, len(NOISE)) == NOISE  # also what had come before the end of the connection was noticed
+    assert port.counters["reads"] < len(NOISE) / 100
+    for _ in range(2):
+        with pytest.raises(PortError, match=r"lost rfc2217://.*the other end closed"):
+            port.read()
+    port.close()
+
+
+def test_what_is_wrong_with_a_network_source_is_said(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    address = server.address
+    server.listening.close()
+    with pytest.raises(PortError, match="nothing listens on that port"):
+        make(f"socket://{address}").open()
+
+    def fail(error: OSError) -> None:
+        def connect(*args: object, **options: object) -> socket.socket:
+            assert options["timeout"] == 5  # bounded
+            raise error
+
+        monkeypatch.setattr(socket, "create_connection", connect)
+
+    for error, said in (
+        (socket.gaierror(-2, "Name or service not known"), r"host name is not known \(Name or service not known\)"),
+        (TimeoutError("timed out"), "no answer: check the address"),
+        (OSError(errno.EHOSTUNREACH, "No route to host"), "no answer: check the address"),
+        (OSError(errno.EAFNOSUPPORT, "Address family not supported"), "install the drop-in network.conf"),
+        (OSError(errno.EPERM, "Operation not permitted"), "install the drop-in network.conf"),
+    ):
+        fail(error)
+        for scheme in ("socket", "rfc2217"):
+            with pytest.raises(PortError, match=said):
+                make(f"{scheme}://receiver.example:5017").open()
+
+
+@pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")
+def test_a_server_without_rfc2217_is_said(server: Server) -> None:
+    with pytest.raises(PortError, match="does not speak RFC 2217: if it sends bytes only, write socket:// instead"):
+        make(f"rfc2217://{server.address}?timeout=0.1").open()
 
 
 def test_close_may_come_from_another_thread(pty: Pty) -> None:

@@ -21,9 +21,9 @@ FUSION = Path(__file__).resolve().parents[2] / "edge_agent" / "fusion"
 ALLOWED_NUMPY = {
     # construction, views, indexing
     "array", "asarray", "empty", "empty_like", "zeros", "zeros_like", "ones", "full", "arange", "concatenate", "stack",
-    "broadcast_to", "flatnonzero", "where", "isfinite", "ndarray",
+    "broadcast_to", "flatnonzero", "count_nonzero", "where", "isfinite", "ndarray",
     # arithmetic that IEEE 754 defines to the last bit, and sorting
-    "sqrt", "abs", "subtract", "maximum", "minimum", "clip", "diff", "sort", "diag", "swapaxes",
+    "sqrt", "abs", "subtract", "maximum", "minimum", "multiply", "clip", "diff", "sort", "diag", "swapaxes",
     # types
     "float64", "int64", "uint8",
 }  # fmt: skip

@@ -138,3 +138,20 @@ def test_save_and_load() -> None:
     other = Gate()
     other.load(feed.gate.save())
     assert other.save() == feed.gate.save()
+
+
+def test_two_misfits_in_a_row_that_agree_are_motion_where_nothing_else_tells() -> None:
+    def judged(levels: list[tuple[float, float, float]], follow: bool) -> list[Action]:
+        gate = Gate()
+        return [
+            gate.judge(
+                k * S // 10, v == ZERO, v == ZERO, 0.0, v, R, SLOW, LIMIT, False, S // 10, 120 * S, 10 * S, follow
+            )
+            for k, v in enumerate(levels)
+        ]
+
+    near, nearly, far = (0.03, 0.0, 0.0), (0.032, 0.001, 0.0), (0.0, 0.3, 0.0)
+    assert judged([near, nearly, ZERO], True) == [Action.SKIP, Action.FOLLOW, Action.USE]
+    assert judged([near, far, near], True) == [Action.SKIP] * 3
+    assert judged([near, ZERO, nearly], True) == [Action.SKIP, Action.USE, Action.SKIP]
+    assert judged([near, nearly, ZERO], False) == [Action.SKIP, Action.SKIP, Action.USE]

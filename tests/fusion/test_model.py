@@ -82,8 +82,8 @@ def test_growth_is_the_predicted_variance() -> None:
         for p in range(2):
             for a in range(3):
                 want = F @ C[:, :, p, a] @ F.T + 0.7 * Qa[:, :, 0, 0] + 0.4 * Qb[:, :, 0, 0]
-                assert var[p, a] == pytest.approx(want[D, D], rel=1e-12)
-                assert var[p, 3 + a] == pytest.approx(want[V, V], rel=1e-12)
+                assert var[a, p] == pytest.approx(want[D, D], rel=1e-12)
+                assert var[3 + a, p] == pytest.approx(want[V, V], rel=1e-12)
 
 
 def test_gap_noise_is_white_noise_that_has_ended() -> None:

@@ -17,6 +17,7 @@ from edge_agent.messages import (
     Estimate,
     FusionFlag,
     GnssFix,
+    HeadingEstimate,
     Innovation,
     Mode,
     Quality,
@@ -41,7 +42,7 @@ def fix(t_ns: int, i: int, std: tuple[float, float, float] = (0.004, 0.005, 0.01
     resolution = (1.1e-4, 1.8e-4, 1e-3)
     return GnssFix(
         *(t_ns, t_ns + 80 * MS, utc_ns, True, 47.123456789 + i * 1e-9, -8.5, 412.3456, 48.1, quality, 17),
-        *(0.7, NAN, 1.1, 0.8, "0042", std, resolution, ("GGA", "GST")),
+        *(0.7, NAN, 1.1, 0.8, "0042", std, resolution, ("GGA", "GST"), 211.5, 0.017),
     )
 
 
@@ -153,7 +154,7 @@ def _point(rng: np.random.Generator, t_ns: np.ndarray, block: int, k: int, log: 
 def _rare(rng: np.random.Generator, t_ns: np.ndarray, now: int) -> Iterator[Record]:
     epoch = int(t_ns[0])
     log, at = now + OFFSET_NS, epoch + OFFSET_NS
-    turned = topics.heading(271.25, 0.05, 0.3, Verdict.ACCEPTED, epoch, at)
+    turned = topics.heading(HeadingEstimate(epoch, 271.25, 0.05, 271.4, 0.2, NAN, 1.5, 0.3, Verdict.ACCEPTED), at)
     yield _derived("/fusion/p1/heading", log, at, turned)
     yield _derived("/fusion/p1/smoothed", log, at, topics.fused_block(replace(estimate(rng, t_ns), revision=1), at))
     values = (("rate_hz", 250.0), ("worst", math.inf))

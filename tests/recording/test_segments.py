@@ -129,6 +129,7 @@ def test_flush_and_fsync_come_when_due(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(os, "fdatasync", lambda fd: synced.append(now / S))
     recorder = start(tmp_path)
     recorder.handle(rotate(), now)
+    recorder.idle(now)
     synced.clear()
     seen = []
     for i in range(1, 101):
@@ -140,6 +141,25 @@ def test_flush_and_fsync_come_when_due(tmp_path: Path, monkeypatch: pytest.Monke
     assert seen == [10 * (i // 10) for i in range(1, 101)]
     assert synced == [105.0, 110.0]
     recorder.close()
+
+
+def test_what_waited_behind_a_rotate_is_flushed_when_it_would_have_been_without(tmp_path: Path) -> None:
+    """GIVEN records that waited nearly a second for the writer WHEN a file is begun THEN they wait no more."""
+    recorder = start(tmp_path)
+    recorder.handle(rotate(), 100 * S)
+    recorder.handle(line(0), 100 * S)
+    recorder.idle(100 * S)  # the first records of a run have waited too
+    assert recorder.path is not None
+    assert texts(recorder.path) == ["x 0"]
+    assert recorder.wait_s(100 * S + S // 4) == 0.75
+    recorder.handle(rotate(T + 60 * S), 101 * S)
+    recorder.handle(line(1), 101 * S)
+    assert recorder.wait_s(101 * S) == 0.0
+    recorder.idle(101 * S)
+    assert recorder.path is not None
+    assert texts(recorder.path) == ["x 1"]
+    recorder.close()
+    assert recorder.wait_s(0) == 1.0
 
 
 def test_a_killed_run_is_recovered_at_the_next_start(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import math
+import struct
 from typing import Any
 
 import numpy as np
@@ -109,6 +110,17 @@ def test_constants_stand_before_their_field_and_mean_the_same(
     names = next(f.names for f in schemas.parse_schema(schema, topics.SCHEMAS[schema])[schema] if f.name == field)
     prefix = "FLAG_" if issubclass(meaning, enum.IntFlag) else ""
     assert names == {int(value): f"{prefix}{value.name}" for value in meaning}
+
+
+def test_a_solution_from_before_course_and_speed_reads_by_its_files_own_text() -> None:
+    data = SAMPLES[topics.GNSS_SOLUTION].data
+    new = topics.decode(topics.GNSS_SOLUTION, data)
+    assert (new["course_deg"], new["speed_mps"]) == (211.5, pytest.approx(0.017))
+    lines = topics.SCHEMAS[topics.GNSS_SOLUTION].splitlines(keepends=True)
+    text = "".join(x for x in lines if not x.startswith(("float32 course_deg", "float32 speed_mps")))
+    at = data.index(struct.pack("<f", 211.5))
+    old = topics.decode(topics.GNSS_SOLUTION, data[:at] + data[at + 8 :], text)
+    assert plain(old) == plain({k: v for k, v in new.items() if k not in ("course_deg", "speed_mps")})
 
 
 def test_topics_have_the_schemas_of_the_table() -> None:

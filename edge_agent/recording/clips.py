@@ -1,0 +1,275 @@
+"""Event clips: the minutes around an event as a file of their own that retention does not touch.
+
+`Watch` collects triggers and faults into intervals: from `before_s` before the first to `after_s` after the last of
+those that overlap, at most `max_s`. `Clips` is a thread that copies all records of an interval, raw and fused at full
+rate, from the segments (the open one too) to `clips/` in the data folder, and then runs the hook. Nothing is held in
+memory for it: what a clip needs is on the disk already. A clip is cut out by monotonic time, which each segment's
+checkpoint ties to its UTC, so a clock that steps meanwhile does no harm.
+
+A clip's metadata names its triggers and the segments that it was taken from. Those replay byte for byte; a clip begins
+amid a segment, without a checkpoint, so `replay` computes it anew from its raw data.
+
+Retention never deletes clips; beyond `clips_gb` new ones are refused, and a fault says so (the segments still hold the
+data). The hook is run without a shell, in a process group of its own that is killed after `hook_s`.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from edge_agent.messages import EventSettings, Fault, Record, S, TriggerSettings
+from edge_agent.recording import topics
+from edge_agent.recording.reader import DamagedError, newest_ns, read_between, read_messages
+from edge_agent.recording.segments import Recorder
+from edge_agent.recording.writer import PART, TIME_MAX, SegmentWriter
+from edge_agent.triggers import BEGIN, END
+
+FOLDER = "clips"
+JOBS = 16
+"""Clips that wait to be written; one more is refused and told."""
+PATIENCE_S = 30.0
+"""How long a clip waits for its last records to reach the disk."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """An interval to be kept, monotonic, and what asked for it."""
+
+    begin_ns: int
+    end_ns: int
+    names: tuple[str, ...]
+
+
+class Watch:
+    """Which interval is to be kept. Times are monotonic and need not be in order."""
+
+    def __init__(self, settings: EventSettings) -> None:
+        self._before = int(settings.before_s * S)
+        self._after = int(settings.after_s * S)
+        self._most = int(settings.max_s * S)
+        self._active: set[str] = set()
+        self._names: list[str] = []
+        self._begin = self._end = 0
+        self._kept = 0  # end of the last clip: the next does not hold the same again
+
+    def begin(self, name: str, t_ns: int) -> None:
+        """An event begins."""
+        self._active.add(name)
+        self._extend(name, t_ns)
+
+    def end(self, name: str, t_ns: int) -> None:
+        """It is over; `t_ns`: when it last was."""
+        if name in self._active:
+            self._active.discard(name)
+            self._extend(name, t_ns)
+
+    def moment(self, name: str, t_ns: int) -> None:
+        """Something that has no length."""
+        self._extend(name, t_ns)
+
+    def _extend(self, name: str, t_ns: int) -> None:
+        begin, end = max(t_ns - self._before, self._kept), t_ns + self._after
+        if not self._names:
+            self._begin, self._end = begin, end
+        self._begin, self._end = min(self._begin, begin), max(self._end, end)
+        if name not in self._names:
+            self._names.append(name)
+
+    def due(self, now_ns: int) -> Job | None:
+        """The interval, once nothing can be added to it."""
+        if not self._names:
+            return None
+        if self._active:
+            self._end = max(self._end, now_ns)
+        full = self._end - self._begin >= self._most
+        if not full and (self._active or now_ns < self._end + self._before):  # an overlapping one may still begin
+            return None
+        if full and now_ns < self._begin + self._most:
+            return None
+        return self._job(min(self._end, self._begin + self._most))
+
+    def rest(self, now_ns: int) -> Job | None:
+        """The interval as far as it has come: the agent ends."""
+        return self._job(min(self._end, now_ns)) if self._names else None
+
+    def _job(self, end_ns: int) -> Job:
+        job = Job(self._begin, end_ns, tuple(self._names))
+        self._names = []
+        self._active.clear()  # of one that goes on beyond the longest clip, the segments hold the rest
+        self._kept = end_ns
+        return job
+
+
+class Clips(threading.Thread):
+    """Writes clips and runs the hook, one after the other. Main tells it what happens; nothing there waits."""
+
+    def __init__(self, recorder: Recorder, settings: EventSettings, triggers: Iterable[TriggerSettings]) -> None:
+        super().__init__(name="clips", daemon=True)
+        self.recorder, self.settings = recorder, settings
+        self.folder = recorder.data_dir / FOLDER
+        self.faults: deque[Fault] = deque()
+        self.failure: BaseException | None = None
+        self.stopping = threading.Event()
+        self._watch = Watch(settings)
+        self._jobs: queue.Queue[Job | None] = queue.Queue(JOBS + 1)
+        self._of_fault: dict[str, list[str]] = {}
+        for t in triggers:
+            if t.fault is not None:
+                self._of_fault.setdefault(t.fault, []).append(t.name)
+
+    def saw(self, record: Record, offset_ns: int) -> None:
+        """A record on /events; `offset_ns` = UTC - monotonic of the open segment."""
+        event = topics.decode(topics.EVENT, record.data)
+        if event["kind"] == BEGIN:
+            self._watch.begin(event["source"], event["monotonic_ns"])
+        elif event["kind"] == END:
+            self._watch.end(event["source"], event["end"]["sec"] * S + event["end"]["nanosec"] - offset_ns)
+
+    def fault(self, kind: str, t_ns: int) -> None:
+        """A fault of that kind, monotonic."""
+        for name in self._of_fault.get(kind, ()):
+            self._watch.moment(name, t_ns)
+
+    def every_second(self, now_ns: int) -> None:
+        """Begin with what is due."""
+        if job := self._watch.due(now_ns):
+            self._offer(job)
+
+    def close(self, now_ns: int) -> None:
+        """The agent ends and its files are closed: what is open or waiting is still written, without hooks."""
+        if job := self._watch.rest(now_ns):
+            self._offer(job)
+        self.stopping.set()
+        self._jobs.put(None)
+
+    def _offer(self, job: Job) -> None:
+        if self._jobs.qsize() >= JOBS:
+            self._tell("CLIP_REFUSED", f"{', '.join(job.names)}: {JOBS} clips are waiting; the segments hold the data")
+            return
+        self._jobs.put_nowait(job)
+
+    def run(self) -> None:
+        try:
+            while (job := self._jobs.get()) is not None:
+                self._one(job)
+        except BaseException as e:  # noqa: BLE001 - main raises it and ends the process
+            self.failure = e
+
+    def _one(self, job: Job) -> None:
+        self._wait_for(job)
+        try:
+            path = self._write(job)
+        except (OSError, DamagedError) as e:
+            self._tell("CLIP_FAILED", f"{', '.join(job.names)}: {e}; the segments hold the data")
+            return
+        if path is None:
+            return
+        seconds = (job.end_ns - job.begin_ns) / S
+        values = (("seconds", seconds), ("bytes", float(path.stat().st_size)))
+        self._tell("CLIP", f"{path.name}: {seconds:.1f} s, {', '.join(job.names)}", values)
+        if self.settings.hook and not self.stopping.is_set() and (said := self._hook(path, job)):
+            self._tell("HOOK_FAILED", f"{self.settings.hook[0]}: {said}")
+
+    def _tell(self, kind: str, text: str, values: tuple[tuple[str, float], ...] = ()) -> None:
+        self.faults.append(Fault(time.monotonic_ns(), "clips", kind, text, values))
+
+    # ----------------------------------------------------------------------------------------------------------- files
+
+    def _wait_for(self, job: Job) -> None:
+        """Until the segments hold the end of the interval; not for ever: the disk may refuse."""
+        end = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end and not self.stopping.is_set():
+            newest = next(_sources(self.recorder.recent, job.end_ns, TIME_MAX), None)
+            if newest is not None and newest_ns(newest[0]) - newest[1] >= job.end_ns:
+                return
+            self.stopping.wait(self.recorder.settings.flush_s)
+
+    def _write(self, job: Job) -> Path | None:
+        sources = [*_sources(self.recorder.recent, job.begin_ns, job.end_ns)][::-1]
+        if not sources:
+            self._tell("CLIP_FAILED", f"{', '.join(job.names)}: no segment holds it")
+            return None
+        self.folder.mkdir(parents=True, exist_ok=True)
+        held = sum(p.stat().st_size for p in self.folder.iterdir())
+        if held >= self.settings.clips_gb * 1e9:
+            text = f"{FOLDER}/ holds {held / 1e9:.3g} GB of {self.settings.clips_gb:g}: move clips away"
+            self._tell("CLIPS_FULL", f"{', '.join(job.names)}: no clip was written, {text}")
+            return None
+        utc_ns = max(0, job.begin_ns + sources[0][1])
+        metadata = {
+            **self.recorder.metadata,
+            "site": self.recorder.site,
+            "clip": ", ".join(job.names),
+            "clip_of": ", ".join(path.name.removesuffix(PART) for path, _ in sources),
+        }
+        part = self._free_name(utc_ns)
+        writer = SegmentWriter(part, metadata=metadata, attachments=self.recorder.attachments, utc_ns=utc_ns)
+        try:
+            for path, offset in sources:
+                for s in read_between(path, job.begin_ns + offset, job.end_ns + offset):
+                    writer.add(Record(s.topic, s.log_ns, s.publish_ns, s.data, False, s.schema))
+            return writer.close()
+        except (OSError, DamagedError):
+            writer.abandon()
+            with suppress(OSError):
+                part.unlink()  # a copy of what the segments hold
+            raise
+
+    def _free_name(self, utc_ns: int) -> Path:
+        stem = f"{self.recorder.site}_{datetime.fromtimestamp(utc_ns // S, UTC):%Y%m%dT%H%M%SZ}"
+        taken = [path.name for path in self.folder.iterdir()]
+        number = 0
+        while any(name.startswith(f"{stem}_{number:03d}.mcap") for name in taken):
+            number += 1
+        return self.folder / f"{stem}_{number:03d}.mcap{PART}"
+
+    # ------------------------------------------------------------------------------------------------------------ hook
+
+    def _hook(self, path: Path, job: Job) -> str:
+        """Run the hook with the clip's path behind its arguments; what went wrong, "" if nothing did."""
+        argv = [*(self.settings.hook or ()), str(path)]
+        environment = {**os.environ, "EDGE_AGENT_TRIGGERS": " ".join(job.names)}
+        environment.pop("NOTIFY_SOCKET", None)  # the hook does not speak for the service
+        try:
+            process = subprocess.Popen(argv, stdin=subprocess.DEVNULL, env=environment, start_new_session=True)
+        except OSError as e:
+            return str(e.strerror or e)
+        end = time.monotonic() + self.settings.hook_s
+        while process.poll() is None and time.monotonic() < end and not self.stopping.is_set():
+            self.stopping.wait(0.05)
+        if process.poll() is None:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            return f"killed: it took longer than {self.settings.hook_s:g} s" if not self.stopping.is_set() else ""
+        return f"exit code {process.returncode}" if process.returncode else ""
+
+
+def _sources(recent: Sequence[Path], begin_ns: int, end_ns: int) -> Iterator[tuple[Path, int]]:
+    """The run's files that begin before `end_ns`, from the newest back to the one that holds `begin_ns`, with UTC -
+    monotonic of each."""
+    for final in reversed(recent):
+        for path in (final, final.with_name(final.name + PART)):
+            try:
+                first = next(read_messages(path, {topics.CHECKPOINT_TOPIC}), None)
+            except (OSError, DamagedError):  # retention was quicker, or it has just been renamed
+                continue
+            if first is None:
+                continue
+            point = topics.decode_checkpoint(first.data)
+            if point.monotonic_ns < end_ns:
+                yield path, point.utc_ns - point.monotonic_ns
+            if point.monotonic_ns <= begin_ns:
+                return
+            break

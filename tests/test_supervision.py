@@ -1,0 +1,374 @@
+"""What watches over the threads: a writer that hangs, ledgers that do not balance, ports that are silent or hang."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from live import Live, ScriptedPort, faults, ledgers, raws, recordings, until, values
+
+from edge_agent import config, reading, runtime
+from edge_agent.messages import MS, Config, Raw, Record, Rotate, S, Tick
+from edge_agent.reading import PortWatch, payload_size
+from edge_agent.recording.segments import Recorder
+from edge_agent.replay import replay
+from edge_agent.simulate import SCENARIOS, simulate
+from edge_agent.simulate.encode import config_yaml, dbc_text, raw_blocks
+from edge_agent.simulate.specs import EPOCH_UTC_NS, START_NS
+
+GNSS, CAN, CLOCK = "gnss", "can", "clock"
+
+
+@pytest.fixture(scope="module")
+def script() -> list[Raw]:
+    return list(raw_blocks(simulate("clean", 1, 12.0)))
+
+
+def settings(folder: Path, *sets: str) -> Config:
+    text = config_yaml(SCENARIOS["clean"], dbc="a.dbc", site="site", data_dir="rec")
+    dbc = dbc_text(SCENARIOS["clean"]).encode()
+    return config.parse(text, folder, lambda name: dbc, ["record.free_gb=0", "record.flush_s=0.05", *sets])
+
+
+def ports() -> dict[str, ScriptedPort]:
+    return {GNSS: ScriptedPort(), CAN: ScriptedPort(), CLOCK: ScriptedPort()}
+
+
+def tick(second: int) -> Raw:
+    t_ns = START_NS + second * S
+    return Raw(t_ns, 0, CLOCK, Tick(t_ns - START_NS + EPOCH_UTC_NS, True, 0))
+
+
+class Time:
+    """A clock that the test sets."""
+
+    def __init__(self) -> None:
+        self.ns = S
+
+    def __call__(self) -> int:
+        return self.ns
+
+
+def pass_by(live: Live, time: Time, seconds: int, *working: str) -> None:
+    """Let time go on, and the readers that work come back from their driver."""
+    time.ns += seconds * S
+    until(lambda: all(live.agent.readers[n].busy_ns == time.ns for n in working), "readers that come back")
+
+
+class Gated(Recorder):
+    """A disk that stops the writer while its gate is closed."""
+
+    gate: threading.Event
+    waiting: threading.Event
+
+    def handle(self, item: Record | Rotate, now_ns: int | None = None) -> None:
+        if not self.gate.is_set():
+            self.waiting.set()
+        assert self.gate.wait(60)
+        super().handle(item, now_ns)
+
+
+@pytest.fixture
+def gated() -> type[Gated]:
+    Gated.gate, Gated.waiting = threading.Event(), threading.Event()
+    Gated.gate.set()
+    return Gated
+
+
+def kinds(files: Sequence[Path], source: str) -> list[str]:
+    return [f["kind"] for f in faults(files) if f["source"] == source]
+
+
+# ----------------------------------------------------------------------------------------------------------- the writer
+
+
+def test_a_writer_that_hangs_is_a_fault_after_5_s_with_its_end(
+    script: list[Raw], tmp_path: Path, gated: type[Gated]
+) -> None:
+    time = Time()
+    with Live(settings(tmp_path), ports(), make_recorder=gated, now=time) as live:
+        live.play(script[:60])
+        live.settle()
+        gated.gate.clear()
+        live.play([tick(3)], step=True)
+        assert gated.waiting.wait(60)
+        time.ns += 5 * S
+        live.play([tick(4)], step=True)
+        assert not any("WRITER_STALLED" in line for line in live.said)
+        for more in (1, 30, 60):
+            time.ns += more * S
+            live.play([tick(5 + more)], step=True)
+        assert [line for line in live.said if "WRITER" in line] == [
+            "recorder: WRITER_STALLED: the disk has not answered for 6 s; records wait in memory"
+        ]
+        gated.gate.set()
+        live.settle()
+        live.play([tick(70)], step=True)
+        live.settle()
+        live.play([tick(71)], step=True)
+    files = recordings(tmp_path / "rec")
+    assert kinds(files, "recorder") == ["WRITER_STALLED", "WRITER_OK"]
+    assert values(faults(files, "WRITER_STALLED")[0])["stalled_s"] == 6
+    assert values(faults(files, "WRITER_OK")[0])["stalled_s"] == 96
+    assert live.balance() == {}
+
+
+def test_memory_is_bounded_while_the_writer_hangs(
+    script: list[Raw], tmp_path: Path, gated: type[Gated], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runtime, "RESERVE_BYTES", 10_000)
+    made = settings(tmp_path, "record.rotate_s=10")
+    made = replace(made, record=replace(made.record, outbox_mb=0.03))
+    with Live(made, ports(), make_recorder=gated) as live:
+        live.play(script[:60], step=True)
+        live.settle()
+        gated.gate.clear()
+        most, block = 0, max(payload_size(r.payload) for r in script) + 200
+        for second in range(3, 60):
+            for raw in (r for r in script if START_NS + 3 * S < r.t_ns <= START_NS + 4 * S and r.source != CLOCK):
+                live.play([replace(raw, t_ns=raw.t_ns + (second - 3) * S)], step=True)
+            live.play([tick(second)], step=True)
+            most = max(most, live.agent.outbox.bytes)
+            if second == 30:
+                after_half = most
+        assert 36_000 < most <= 30_000 + 10_000 + block
+        assert most == after_half
+        assert live.agent.accounts[CLOCK].refused > 20
+        gated.gate.set()
+        live.settle()
+        live.play([tick(60)], step=True)
+        live.settle()
+    files = recordings(tmp_path / "rec")
+    assert live.balance() == {}
+    told = sum(values(f)["count"] for f in faults(files, "LOSS") if f["source"] == f"/raw/{CLOCK}")
+    assert told == live.agent.accounts[CLOCK].refused
+    assert not faults(files, "LEDGER")
+    assert replay(files, None, None, True).ok
+
+
+# --------------------------------------------------------------------------------------------------------- the ledgers
+
+
+def test_a_block_that_main_forgets_is_a_fault_with_the_figures(script: list[Raw], tmp_path: Path) -> None:
+    with Live(settings(tmp_path), ports()) as live:
+        live.play(script[:100], step=True)
+        live.settle()
+        step = live.agent._step
+        live.agent._step = lambda arrival, payload, tick: None  # type: ignore[method-assign]
+        live.play([r for r in script[100:130] if r.source == CAN][:1], step=True)
+        live.agent._step = step  # type: ignore[method-assign]
+        live.play(script[130:200], step=True)
+        live.settle()
+    files = recordings(tmp_path / "rec")
+    (fault,) = faults(files, "LEDGER")
+    assert fault["source"] == CAN
+    assert fault["text"].startswith("1 blocks are unaccounted for: received ")
+    figures = dict(part.rsplit(" ", 1) for part in fault["text"].split(": ")[1].split(", "))
+    assert list(figures) == ["received", "written", "queued", "dropped_inbox", "refused_outbox", "lost_disk"]
+    received, *others = map(int, figures.values())
+    assert received == sum(others) + 1
+    assert values(fault)["missing"] == 1
+    assert ledgers(files)[CAN]["received"] - sum(int(ledgers(files)[CAN][k]) for k in list(figures)[1:]) == 1
+
+
+def test_a_block_that_the_writer_forgets_is_a_fault(script: list[Raw], tmp_path: Path) -> None:
+    with Live(settings(tmp_path), ports()) as live:
+        live.play(script[:60], step=True)
+        live.settle()
+        write = live.agent.writer._write
+        forgotten: list[Record | Rotate] = []
+
+        def careless(item: Record | Rotate, now: int) -> bool:
+            if isinstance(item, Record) and item.topic == f"/raw/{GNSS}" and not forgotten:
+                forgotten.append(item)
+                return True
+            return write(item, now)
+
+        live.agent.writer._write = careless  # type: ignore[method-assign]
+        live.play(script[60:80], step=True)
+        live.settle()
+        until(lambda: live.agent.writer.books[GNSS].taken > live.agent.writer.books[GNSS].written, "closed books")
+        live.play([tick(9)], step=True)
+        live.play([tick(10)], step=True)
+    (fault,) = faults(recordings(tmp_path / "rec"), "LEDGER")
+    assert (fault["source"], values(fault)["missing"]) == (GNSS, 1)
+
+
+def test_a_held_block_that_vanishes_from_the_ring_is_a_fault(tmp_path: Path, script: list[Raw]) -> None:
+    with Live(settings(tmp_path), ports(), free_bytes=lambda: 0) as live:  # no file can be begun
+        live.play(script[:60], step=True)
+        live.settle()
+        until(lambda: live.agent.writer.books[CAN].ring > 5, "blocks in the ring")
+        live.play([tick(9)], step=True)
+        assert not any("LEDGER" in line for line in live.said)
+        ring = live.agent.writer._ring
+        live.settle()
+        ring.remove(next(r for r in ring if isinstance(r, Record) and r.topic == f"/raw/{CAN}"))
+        live.play([tick(10)], step=True)
+        live.settle()
+        before = live.agent.writer.books
+        until(lambda: live.agent.writer.books is not before, "closed books")
+        live.play([tick(11)], step=True)
+        assert sum("LEDGER: 1 blocks" in line for line in live.said) == 1
+
+
+def test_a_codec_that_miscounts_is_a_fault(script: list[Raw], tmp_path: Path) -> None:
+    with Live(settings(tmp_path), ports()) as live:
+        live.play(script[:100], step=True)
+        live.agent.pipeline.receivers["rover"].codec.counters["rejected"] += 2
+        live.agent.pipeline.receivers["rover"].codec.counters["skipped_bytes"] -= 1
+        live.agent.pipeline.accelerometers["acc"].codec.counters["frames"] += 3
+        live.play(script[100:200], step=True)
+    told = {f["source"]: f["text"] for f in faults(recordings(tmp_path / "rec"), "LEDGER")}
+    assert told["rover"] == "2 of 2 rejects came without a reason"
+    assert told["acc frames"].startswith("3 frames of ")
+    assert told["rover bytes"].startswith("1 bytes of ")
+    assert set(told) == {"rover", "rover bytes", "acc frames"}
+
+
+def test_garbage_and_losses_balance(script: list[Raw], tmp_path: Path) -> None:
+    bad = b"$GNGGA,1,2,3*00\r\n$GNGGA,1,2,3\r\n$GN$GNGGA,\x01\xb5b\x01\x07\x02\x00xx\x00\x00$GNGST,1,2,3*55\r\n"
+    with Live(settings(tmp_path), ports()) as live:
+        for i, raw in enumerate(script):
+            live.play([raw], step=True)
+            if i % 7 == 0:
+                live.play([Raw(raw.t_ns, 0, GNSS, bad[: i % len(bad)])], step=True)
+    files = recordings(tmp_path / "rec")
+    assert live.agent.pipeline.receivers["rover"].codec.counters["rejected"] > 20
+    assert not faults(files, "LEDGER")
+
+
+# ----------------------------------------------------------------------------------------------------------- the ports
+
+
+def test_a_silent_port_is_due_after_10_20_40_up_to_300_s_until_something_comes() -> None:
+    watch = PortWatch("can")
+    due = []
+    for second in range(1000):
+        moving = second if second < 5 or second > 700 else 5
+        watch.look(second * S, {"bytes": moving, "good": moving, "positions": 0})
+        if watch.reopen_due(second * S):
+            due.append((second, watch.state, watch.reopens))
+    assert due == [(21, "SILENT", 1), (41, "SILENT", 2), (81, "SILENT", 3), (161, "SILENT", 4), (321, "SILENT", 5),
+                   (621, "SILENT", 6)]  # fmt: skip
+
+
+def test_a_silent_bus_is_opened_again_and_a_working_port_is_left_alone(script: list[Raw], tmp_path: Path) -> None:
+    made = ports()
+    fixes = [r for r in script if r.source == GNSS]
+    with Live(settings(tmp_path), made) as live:
+        live.play([tick(0)], step=True)
+        until(lambda: made[CAN].counters["opens"] == 1, "the bus is open")
+        for second in range(1, 60):
+            live.play([fixes[second], tick(second)], step=True)
+            if second in (16, 36):
+                opens = 2 if second == 16 else 3
+                until(lambda n=opens: made[CAN].counters["opens"] == n, "the bus is open again")
+        assert made[GNSS].counters["opens"] == 1
+        assert live.agent.accounts[CAN].reopened == 2
+        assert made[CAN].counters["closes"] == 2
+        live.play([r for r in script if r.source == CAN][:5], step=True)
+        live.play([tick(60)], step=True)
+        assert live.agent.accounts[CAN].received == 5
+    files = recordings(tmp_path / "rec")
+    assert kinds(files, CAN) == ["SILENT", "PORT_REOPEN", "OK"]
+    assert len([r for r in raws(files) if r.source == CAN]) == 5
+    assert replay(files, None, None, True).ok
+
+
+class Stuck(ScriptedPort):
+    """A driver that does not come back from a read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.entered, self.free = threading.Event(), threading.Event()
+
+    def read(self) -> list[tuple[int, Any]]:
+        self.entered.set()
+        assert self.free.wait(60)
+        return []
+
+
+def test_a_reader_that_hangs_is_replaced_alone(script: list[Raw], tmp_path: Path) -> None:
+    time, made, fresh = Time(), ports(), ScriptedPort()
+    stuck = Stuck()
+    asked: list[str] = []
+
+    def make_port(name: str) -> ScriptedPort:
+        asked.append(name)
+        return fresh
+
+    with Live(settings(tmp_path), {**made, CAN: stuck}, now=time, make_port=make_port) as live:
+        live.play([tick(0)], step=True)
+        assert stuck.entered.wait(60)
+        old = live.agent.readers[CAN]
+        pass_by(live, time, 30, GNSS)
+        live.play([tick(1)], step=True)
+        assert asked == []
+        pass_by(live, time, 1, GNSS)
+        live.play([tick(2)], step=True)
+        assert asked == [CAN]
+        made[CAN] = live.ports = {**live.ports, CAN: fresh}  # type: ignore[assignment]
+        live.play([r for r in script if r.source == CAN][:5], step=True)
+        live.play([tick(3)], step=True)
+        assert asked == [CAN]
+        stuck.free.set()
+        old.join(60)
+        assert not old.is_alive()
+        assert stuck.counters["closes"] == 1
+        live.play([r for r in script if r.source == CAN][5:10], step=True)
+    files = recordings(tmp_path / "rec")
+    assert kinds(files, CAN)[:2] == ["PORT_HUNG", "PORT_OPEN"]
+    assert len([r for r in raws(files) if r.source == CAN]) == 10
+
+
+def test_no_more_than_three_readers_of_a_port_hang(tmp_path: Path) -> None:
+    time = Time()
+    all_stuck = [Stuck()]
+
+    def make_port(name: str) -> Stuck:
+        all_stuck.append(Stuck())
+        return all_stuck[-1]
+
+    with Live(settings(tmp_path), {**ports(), CAN: all_stuck[0]}, now=time, make_port=make_port) as live:
+        live.play([tick(0)], step=True)
+        for second in range(1, 10):
+            assert all_stuck[-1].entered.wait(60)
+            pass_by(live, time, 31, GNSS)
+            live.play([tick(second)], step=True)
+        assert len(all_stuck) == 1 + reading.HUNG_MOST
+        for port in all_stuck:
+            port.free.set()
+    assert sum(line.startswith("can: PORT_HUNG") for line in live.said) == reading.HUNG_MOST
+
+
+def test_the_status_of_a_stalled_disk_and_a_hung_port_says_so(
+    script: list[Raw], tmp_path: Path, gated: type[Gated]
+) -> None:
+    from edge_agent import status as st
+
+    time, stuck, run = Time(), Stuck(), tmp_path / "run"
+    made: dict[str, Any] = {**ports(), CAN: stuck}
+    with Live(settings(tmp_path), made, make_recorder=gated, now=time, status_dir=run) as live:
+        live.play([r for r in script[:60] if r.source != CAN], step=True)
+        assert stuck.entered.wait(60)
+        live.settle()
+        gated.gate.clear()
+        live.play([tick(3)], step=True)
+        assert gated.waiting.wait(60)
+        pass_by(live, time, 31, GNSS)
+        live.play([tick(4)], step=True)
+        at = EPOCH_UTC_NS + 4 * S
+        until(lambda: st.load([run])[1].written_utc_ns == at, "the status of a stalled disk")
+        s = st.load([run])[1]
+        assert (s.disk.state, s.disk.stalled_s, s.disk.stalls) == ("stalled", 31.0, 1)
+        assert [p.state for p in s.ports] == ["OK", "HUNG"]
+        text = st.render(s, 80, 24, at + 100 * MS)
+        assert "! the disk has not answered for 31 s: records wait in memory" in text
+        assert "! port can HUNG for" in text
+        gated.gate.set()
+        stuck.free.set()
