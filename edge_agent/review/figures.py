@@ -1,0 +1,347 @@
+"""The figures of a review as plain values (the JSON twin), and what an engineer would say of them first.
+
+`as_json` holds every number that the page shows, in SI units with the unit in the name; NaN is null. `findings` says
+what went wrong, the worst first, `conclusions` what was found, one sentence each.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from edge_agent.cat import iso
+from edge_agent.messages import AccelFlag, S, Verdict
+from edge_agent.review.agree import CLOCK_S, Agreement
+from edge_agent.review.charts import length, utc
+from edge_agent.review.gather import Extreme, PointFigures, Review, gaps_of, modes_of
+from edge_agent.review.panels import AXES, MM, SENSOR_EVENTS, absent, mm, number, offset_known, percent, quality_name
+from edge_agent.review.spectra import Spectrum
+
+OFTEN = 0.25
+"""Windows against the accelerometer above this share are a contradiction."""
+LISTED = 2000
+"""Events and gaps in the JSON twin at most."""
+
+
+class Finding(NamedTuple):
+    """`level`: 0 the result is in doubt, 1 data was lost or is missing, 2 worth knowing."""
+
+    level: int
+    text: str
+
+
+def _value(x: float, digits: int = 9) -> float | None:
+    return float(f"{x:.{digits}g}") if math.isfinite(x) else None
+
+
+def availability_of(r: Review, p: PointFigures) -> float:
+    """Share of the period for which a valid displacement is there."""
+    return min(p.valid.covered_ns / S / r.seconds, 1.0)
+
+
+def _extreme(e: Extreme | None) -> dict[str, Any] | None:
+    if e is None:
+        return None
+    return {"value_m": _value(e.value_m), "std_m": _value(e.std_m), "utc": iso(e.utc_ns)}
+
+
+def _spectrum(s: Spectrum | None) -> dict[str, Any] | None:
+    if s is None:
+        return None
+    keep = slice(None, None, max(1, len(s.freq_hz) // 1500))
+    return {
+        "segments": s.segments,
+        "resolution_hz": _value(float(s.freq_hz[1])),
+        "lines": len(s.freq_hz),
+        "freq_hz": [_value(v, 6) for v in s.freq_hz[keep].tolist()],
+        **{f"psd_{a}": [_value(v, 5) for v in s.psd[keep, i].tolist()] for i, a in enumerate(AXES)},
+    }
+
+
+def _point(r: Review, name: str, p: PointFigures) -> dict[str, Any]:
+    point = r.overview.points[name]
+    a, d = p.agreement, p.differences
+    n = sum(point.verdicts.values())
+    return {
+        "receiver": p.receiver or None,
+        "accelerometer": p.accelerometer or None,
+        "availability": _value(availability_of(r, p)),
+        "valid_s": _value(p.valid.covered_ns / S),
+        "samples": point.stream.samples,
+        "valid_samples": p.moments.n,
+        "modes": {k: _value(v) for k, v in modes_of(point).items()},
+        "displacement": {
+            axis: {
+                "least": _extreme(p.low[i]),
+                "largest": _extreme(p.high[i]),
+                "mean_m": _value(float(p.moments.mean[i])),
+                "rms_about_mean_m": _value(float(p.moments.std[i])),
+                "mean_std_m": _value(float(p.std_m.mean[i])),
+                "mean_std_smoothed_m": _value(float(p.smoothed_std_m.mean[i])) if p.smoothed_std_m.n else None,
+            }
+            for i, axis in enumerate(AXES)
+            if p.moments.n
+        },
+        "gate": {
+            "fixes": n,
+            "verdicts": {Verdict(v).name: k for v, k in sorted(point.verdicts.items())},
+            "over_limit": point.over,
+            "innovation2_over_variance": [_value(float(v)) for v in p.nis] if p.gated else None,
+            "smallest_step_refused_m": [_value(math.sqrt(16.27) * float(v)) for v in p.std_residual_m]
+            if p.gated
+            else None,
+        },
+        "gaps": _listed(absent(r, p)),
+        "frequencies": [
+            {k: _value(v) if isinstance(v, float) else v for k, v in f._asdict().items()} for f in p.frequencies
+        ],
+        "spectra": {
+            "accelerations_m2ps4pHz": _spectrum(p.accel_spectrum),
+            "fused_m2pHz": _spectrum(p.fused_spectrum),
+            "gnss_m2pHz": _spectrum(p.gnss_spectrum),
+        },
+        "agreement": None
+        if a is None
+        else {
+            "verdict": a.verdict,
+            "text": a.text,
+            "offset_s": _value(a.offset.value_s) if offset_known(a) else None,
+            "std_offset_s": _value(a.offset.std_s) if offset_known(a) else None,
+            "offset_observable": offset_known(a),
+            "yaw_deg": _value(a.mounting.yaw_deg),
+            "std_yaw_deg": _value(a.mounting.std_yaw_deg),
+            "axes": list(a.mounting.axes),
+            "mounting_observable": a.mounting.observable,
+        },
+        "second_difference": None
+        if d is None
+        else {
+            "correlation": [_value(float(v)) for v in d.correlation],
+            "gain": [_value(float(v)) for v in d.gain],
+            "rms_mps2": [_value(float(v)) for v in d.rms_mps2],
+        },
+        "critical_hz": None if p.split is None else _value(p.split.critical_hz),
+        "notes": p.notes,
+    }
+
+
+def _gaps(r: Review, stream: Any) -> list[dict[str, Any]]:
+    return _listed([(a, b, why.lower().replace("_", " ")) for a, b, why in gaps_of(r, stream)])
+
+
+def _listed(gaps: list[tuple[int, int, str]]) -> list[dict[str, Any]]:
+    return [
+        {"begin_utc": iso(a), "end_utc": iso(b), "seconds": _value((b - a) / S), "reason": why}
+        for a, b, why in gaps[:LISTED]
+    ]
+
+
+def as_json(r: Review) -> dict[str, Any]:
+    """Everything, as plain values."""
+    receivers, sensors = {}, {}
+    for name, x in r.overview.receivers.items():
+        latency = r.latency[name]
+        n = x.stream.samples
+        place = r.places.get(name)
+        receivers[name] = {
+            "fixes": n,
+            "rate_hz": _value(S / x.stream.usual_ns) if x.stream.usual_ns else None,
+            "quality": {quality_name(q): _value(k / n) for q, k in sorted(x.qualities.items())},
+            "mean_latency_s": _value(float(latency.mean[0])) if latency.n else None,
+            "std_latency_s": _value(float(latency.std[0])) if latency.n else None,
+            "llh_deg_deg_m": [_value(v, 12) for v in place] if place else None,
+            "gaps": _gaps(r, x.stream),
+        }
+    for name, a in r.overview.accelerometers.items():
+        low, high = a.xyz.spans()[1:3]
+        sensors[name] = {
+            "samples": a.stream.samples,
+            "rate_hz": _value(S * (a.stream.samples - 1) / a.stream.covered_ns) if a.stream.covered_ns else None,
+            "flags": {AccelFlag(v).name: n for v, n in sorted(a.flags.items())},
+            "least_mps2": [_value(float(v)) for v in np.nanmin(low, axis=0)] if len(low) else None,
+            "largest_mps2": [_value(float(v)) for v in np.nanmax(high, axis=0)] if len(high) else None,
+            "gaps": _gaps(r, a.stream),
+        }
+    from edge_agent.verify import as_json as verify_json
+
+    checked = verify_json(r.verdict)
+    return {
+        "site": r.config.site,
+        "begin_utc": iso(r.begin_ns),
+        "end_utc": iso(r.end_ns),
+        "seconds": _value(r.seconds),
+        "conclusions": conclusions(r),
+        "findings": [f.text for f in findings(r)],
+        "damaged": [{"file": str(p), "what": why} for p, why in sorted(r.damaged.items())],
+        "points": {name: _point(r, name, p) for name, p in r.points.items()},
+        "receivers": receivers,
+        "accelerometers": sensors,
+        "losses": [
+            {"source": s, "where": w, "count": n}
+            for (s, w), n in sorted(
+                {
+                    (s, w): sum(c for f in r.verdict.files for a, b, c, _, _ in f.losses if (a, b) == (s, w))
+                    for f in r.verdict.files
+                    for s, w, _, _, _ in f.losses
+                }.items()
+            )
+        ],
+        "rejected": [{"source": s, "reason": w, "count": n} for (s, w), n in sorted(r.rejects.items())],
+        "missing_raw_blocks": r.overview.missing,
+        "event_counts": dict(sorted(r.overview.kinds.items())),
+        "events": [
+            {
+                "begin_utc": iso(h.begin_ns),
+                "end_utc": iso(h.end_ns),
+                "kind": h.kind,
+                "source": h.source,
+                "text": h.text,
+                "values": {k: _value(v) for k, v in h.values.items()},
+                "fault": h.fault,
+            }
+            for h in r.overview.happened[:LISTED]
+        ],
+        "runs": len([run for run in r.overview.runs if run]) or 1,
+        "configurations": r.configs,
+        "verify": checked,
+    }
+
+
+# --------------------------------------------------------------------------------------------------------- first words
+
+
+def conclusions(r: Review) -> list[str]:
+    """What an engineer would say of the record, in a few sentences."""
+    n = len(r.verdict.files)
+    out = [
+        f"{r.config.site}: {utc(r.begin_ns)} to {utc(r.end_ns)} UTC, {length(r.seconds)}, "
+        f"from {n} file{'s' if n != 1 else ''}."
+    ]
+    for name, p in r.points.items():
+        if not p.moments.n:
+            out.append(f"{name}: no valid displacement in this period.")
+            continue
+        words = [f"{name}: a valid displacement for {percent(availability_of(r, p))} of the time"]
+        start = sum(b - a for a, b, m in p.spells if m == 0)
+        begin = p.valid.begin_ns - r.begin_ns
+        if begin > 5 * S or start > 5 * S:
+            words.append(f"it begins {length(begin / S)} into the record, when the filter has started")
+        out.append("; ".join(words) + ".")
+        told = []
+        for i, axis in enumerate(AXES):
+            lo, hi = p.low[i], p.high[i]
+            if lo is None or hi is None:
+                continue
+            e = max((lo, hi), key=lambda v: abs(v.value_m))
+            told.append(f"{axis} {mm(e.value_m)} \u00b1 {mm(e.std_m)} mm at {utc(e.utc_ns)[11:]}")
+        out.append(f"{name}: furthest displacement (\u00b1 one sd) " + ", ".join(told) + ".")
+        if p.frequencies:
+            seen = ", ".join(number(f.freq_hz, 2 if f.freq_hz >= 10 else 3) for f in p.frequencies)
+            fused = sum(math.isfinite(f.fused_hz) for f in p.frequencies)
+            raw = sum(math.isfinite(f.gnss_hz) for f in p.frequencies)
+            told_raw = f", {raw} of the raw fixes" if p.gnss_spectrum is not None else ""
+            out.append(
+                f"{name}: dominating frequencies {seen} Hz in the accelerations; {fused} of {len(p.frequencies)} stand "
+                f"out of the fused displacement{told_raw}."
+            )
+        if p.agreement is not None and p.agreement.verdict != "CONTRADICTION":
+            out.append(f"{name}: {p.agreement.text}.")
+        elif p.agreement is not None and not in_doubt(p.agreement):
+            out.append(f"{name}: receiver and accelerometer tell of the same motion most of the time.")
+    for name, x in r.overview.receivers.items():
+        if x.stream.samples:
+            shares = sorted(x.qualities.items(), key=lambda i: -i[1])
+            told = [f"{percent(k / x.stream.samples)} {quality_name(q).lower()}" for q, k in shares]
+            latency = r.latency[name]
+            words_late = f", latency {1e3 * float(latency.mean[0]):.0f} ms in the mean" if latency.n else ""
+            out.append(f"{name}: {x.stream.samples} fixes, {', '.join(told)}{words_late}.")
+    return out
+
+
+def in_doubt(a: Agreement) -> bool:
+    """Whether a contradiction is more than a window or two: a clock, an axis, or a good part of the windows."""
+    if a.verdict != "CONTRADICTION":
+        return False
+    clock = a.offset.observable and abs(a.offset.value_s) > max(3 * a.offset.std_s, CLOCK_S)
+    axes = any(found not in ("?", want) for found, want in zip(a.mounting.axes, ("+x", "+y", "+z"), strict=True))
+    return clock or axes or len(a.contradictions) > OFTEN * len(a.t_ns) or not len(a.t_ns)
+
+
+def findings(r: Review) -> list[Finding]:
+    """What went wrong, the worst first."""
+    out = []
+    for name, p in r.points.items():
+        a = p.agreement
+        if a is not None and in_doubt(a):
+            out.append(Finding(0, f"{name}: {a.text}"))
+        elif a is not None and a.contradictions:
+            text = f"in {len(a.contradictions)} of {len(a.t_ns)} windows the fixes speak against the accelerations"
+            out.append(Finding(2, f"{name}: {text}; a wrong fix that the gate let in does that too"))
+        out += [
+            Finding(0, f"{name}: {kind.lower().replace('_', ' ')} told {_times(n)}")
+            for kind, n in _counted(r, name, ("CONTRADICTION",))
+        ]
+        worst = max((float(v) for v in p.nis), default=0.0)
+        if p.gated > 100 and not 0.3 < worst < 3.0:
+            out.append(
+                Finding(0, f"{name}: the filter's sd is not honest: innovations\u00b2 are {worst:.1f} x the variance")
+            )
+    for path, why in sorted(r.damaged.items()):
+        out.append(Finding(1, f"{path.name} is damaged: {why}"))
+    by_reason: dict[str, list[float]] = {}
+    for g in r.verdict.gaps:
+        by_reason.setdefault(g.reason, []).append((g.end_ns - g.begin_ns) / S)
+    for reason, gaps in sorted(by_reason.items()):
+        out.append(Finding(1, f"raw data missing {_times(len(gaps))}, {length(sum(gaps))} in all: {reason}"))
+    if r.overview.missing:
+        out.append(Finding(1, f"{r.overview.missing} raw blocks are in no file"))
+    for name, p in r.points.items():
+        for kind, n in _counted(r, name, ("JUMP_OPEN", "DATUM", "REACQUIRE", "OUTAGE_END", "ACCEL_LOST", "ACCEL_GAP")):
+            out.append(Finding(2, f"{name}: {_WORDS[kind]}, {_times(n)}"))
+        verdicts = r.overview.points[name].verdicts
+        refused, n = verdicts.get(int(Verdict.REJECTED), 0), sum(verdicts.values())
+        if refused:
+            out.append(Finding(2, f"{name}: {refused} of {n} fixes were refused ({percent(refused / n)})"))
+        dead = sum(b - a for a, b, m in p.spells if m in (5, 6)) / S
+        if dead > 1:
+            out.append(Finding(1, f"{name}: the estimate was invalid for {length(dead)}"))
+    for name in (*r.overview.accelerometers, *r.overview.receivers, *r.config.ports):
+        for kind, n in _counted(r, name, SENSOR_EVENTS):
+            if not kind.endswith(("_END", "_OPEN")):
+                out.append(Finding(2, f"{name}: {kind.lower().replace('_', ' ')}, {_times(n)}"))
+    for name, sensor in r.overview.accelerometers.items():
+        hit = sensor.flags.get(AccelFlag.SATURATED.value, 0)
+        if hit:
+            out.append(Finding(1, f"{name}: {hit} samples at the end of the sensor's range"))
+        if not sensor.stream.samples:
+            out.append(Finding(1, f"{name}: no sample in these files"))
+    for (source, reason), n in sorted(r.rejects.items(), key=lambda i: -i[1])[:5]:
+        out.append(Finding(2, f"{source}: input refused {_times(n)}, {reason}"))
+    out += [Finding(1, text) for text in r.verdict.wanting if not any(p.name in text for p in r.damaged)][:10]
+    if r.open_files:
+        out.append(Finding(2, f"{', '.join(p.name for p in r.open_files[:5])}: being written, or torn (`recover`)"))
+    return sorted(out, key=lambda f: f.level)
+
+
+_WORDS = {
+    "JUMP_OPEN": "fixes jumped to another level (they were used less that level)",
+    "DATUM": "the zero moved: a level that stayed was taken over",
+    "REACQUIRE": "the estimate was opened anew",
+    "OUTAGE_END": "an outage of fixes",
+    "ACCEL_LOST": "accelerations were lost",
+    "ACCEL_GAP": "a gap in the accelerations",
+}
+
+
+def _times(n: int) -> str:
+    return "once" if n == 1 else f"{n} times"
+
+
+def _counted(r: Review, source: str, kinds: tuple[str, ...]) -> list[tuple[str, int]]:
+    found = [(k, sum(h.kind == k and h.source == source for h in r.overview.happened)) for k in kinds]
+    return [(k, n) for k, n in found if n]
+
+
+__all__ = ["MM", "Finding", "as_json", "conclusions", "findings"]

@@ -1,0 +1,722 @@
+"""One pass over recordings -> everything that the report tells, in memory that does not grow with their length.
+
+`verify` says what is missing and why, `series.pieces` hands out the data, `series.Overview` keeps envelopes and counts.
+Added here: extremes of the valid displacement with their sd, spectra averaged on the way, the smoothed stream, the
+busiest minutes of each point (for the questions that need all samples at once) and a close look at each extreme.
+Displacement counts where its mode is valid; what is not valid is in the mode's strip, not in the figures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from edge_agent import verify
+from edge_agent.messages import F64, I64, U8, VALID_MODES, Config, Mode, Quality, S, Verdict
+from edge_agent.recording import topics
+from edge_agent.recording.reader import DamagedError, read_attachments, read_messages
+from edge_agent.recording.writer import PART
+from edge_agent.replay import CONFIG_NAME, ReplayError
+from edge_agent.review import spectra
+from edge_agent.review.agree import Agreement, agree
+from edge_agent.review.integrate import Differences, second_difference
+from edge_agent.review.series import (
+    KEPT,
+    Accelerometer,
+    Envelope,
+    Happened,
+    Overview,
+    Piece,
+    Point,
+    Receiver,
+    Stream,
+    configuration,
+    files_of,
+    pieces,
+)
+from edge_agent.review.smooth import Accelerations, plain
+from edge_agent.review.smoothed import Smoothed
+from edge_agent.review.splits import Split, split_fusion
+
+SPANS = 2000
+"""Spans of an envelope that is drawn: one for each pixel of a wide plot."""
+FINEST_NS = 20_000_000
+"""Its shortest span; it doubles as the record grows."""
+SEGMENT_S = (8.0, 100.0)
+"""Shortest and longest segment of a spectrum: a fifth of the record between them."""
+CHUNK = 6
+"""Segments that are averaged at a time."""
+BUSY_S = (120.0, 600.0)
+"""The busiest stretch that is kept of each point is so long: the longer one where fixes are rare,"""
+BUSY_FIXES = (100, 1200)
+"""least fixes that it must hold, and those that are enough."""
+TRUSTED = 0.6
+"""Where the gate took so large a share of the fixes, what it refused is left out of the questions to the sensors; one
+that refuses more may be wrong itself, for example where the accelerometer contradicts."""
+CLOSE_NS = 6 * S
+"""A close look reaches so far to both sides of an extreme."""
+PEAK_DB = 9.0
+"""A frequency is told as dominating where accelerations stand so far above their floor."""
+MODES = 8
+"""Frequencies told of one accelerometer at most, the highest above the floor."""
+SAME = 0.03
+"""Peaks of two sensors are one frequency within this share,"""
+SAME_LINES = 1.5
+"""or within so many lines of the spectrum."""
+
+
+class Extreme(NamedTuple):
+    """A displacement, its sd and when."""
+
+    value_m: float
+    std_m: float
+    utc_ns: int
+
+
+class Close(NamedTuple):
+    """A close look: utc_ns (n,), displacement and sd (n,) of one axis at full rate."""
+
+    axis: int
+    utc_ns: I64
+    displacement_m: F64
+    std_m: F64
+
+
+@dataclass
+class Moments:
+    """Count, mean and rms about the mean of what has passed, per axis (3,)."""
+
+    n: int = 0
+    mean: F64 = field(default_factory=lambda: np.zeros(3))
+    m2: F64 = field(default_factory=lambda: np.zeros(3))
+
+    def add(self, x: F64) -> None:
+        """Values (n, c), all finite (Chan, Golub & LeVeque 1983)."""
+        if not len(x):
+            return
+        if not self.n:
+            self.mean, self.m2 = np.zeros(x.shape[1]), np.zeros(x.shape[1])
+        mean, n = x.mean(axis=0), self.n + len(x)
+        apart = mean - self.mean
+        self.m2 = self.m2 + ((x - mean) ** 2).sum(axis=0) + apart * apart * (self.n * len(x) / n)
+        self.mean, self.n = self.mean + apart * (len(x) / n), n
+
+    @property
+    def std(self) -> F64:
+        return np.asarray(np.sqrt(self.m2 / max(self.n, 1)))
+
+
+def _rising(t: I64) -> npt.NDArray[np.bool_]:
+    """Times later than all before them: a file that is there twice must not turn time back."""
+    good = np.ones(len(t), np.bool_)
+    good[1:] = t[1:] > np.maximum.accumulate(t)[:-1]
+    return good
+
+
+class Averaged:
+    """Welch's density of a stream of any length, and the stretch of it that moved most."""
+
+    def __init__(self, segment_s: float) -> None:
+        self.segment_s = segment_s
+        self.rate_hz = 0.0
+        self.busiest: spectra.Uniform | None = None
+        self._power = -1.0
+        self._total: F64 = np.zeros(0)
+        self._freq: F64 = np.zeros(0)
+        self._segments = 0
+        self._rows: list[tuple[I64, F64]] = []
+        self._run = ""
+
+    def add(self, run: str, t_ns: I64, x: F64) -> None:
+        if not len(t_ns):
+            return
+        if run != self._run:
+            self.flush()
+            self._run = run
+        self._rows.append((t_ns, x))
+        if t_ns[-1] - self._rows[0][0][0] > CHUNK * self.segment_s * S:
+            self.flush()
+
+    def flush(self) -> None:
+        rows, self._rows = self._rows, []
+        if not rows:
+            return
+        t, x = np.concatenate([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
+        good = np.isfinite(x).all(axis=1)
+        t, x = t[good], x[good]
+        rising = _rising(t)
+        t, x = t[rising], x[rising]
+        if len(t) < 16:
+            return
+        if not self.rate_hz:
+            self.rate_hz = S / float(np.median(np.diff(t)))
+        u = spectra.uniform(t, x, self.rate_hz)
+        try:
+            found = spectra.welch(u.x, u.rate_hz, max(8, round(self.segment_s * self.rate_hz)), valid=u.valid)
+        except ValueError:  # no whole segment in it
+            return
+        power = float(found.psd[1:].sum()) * found.segments
+        if power > self._power:
+            self._power, self.busiest = power, u
+        self._freq = found.freq_hz
+        self._total = found.psd * found.segments + (self._total if self._segments else 0.0)
+        self._segments += found.segments
+
+    def spectrum(self) -> spectra.Spectrum | None:
+        """The average with its 95 % limits; None where there was no whole segment."""
+        self.flush()
+        n = self._segments
+        if not n:
+            return None
+        psd = self._total / n
+        dof = 2.0 * n / (1.0 + 2.0 * spectra.HANN_OVERLAP * (n - 1) / n)
+        c = 2.0 / (9.0 * dof)  # chi-square quantiles after Wilson & Hilferty (1931)
+        low, high = (dof / (dof * max(1.0 - c + z * math.sqrt(c), 0.05) ** 3) for z in (1.96, -1.96))
+        return spectra.Spectrum(self._freq, psd, psd * low, psd * high, n, 0.95)
+
+
+class Frequency(NamedTuple):
+    """A frequency at which a structure moves: of the accelerations with sd and damping (NaN: no fit), the axes that
+    show it, height above the floor; the nearest peak of fused and raw displacement, NaN = none."""
+
+    freq_hz: float
+    std_hz: float
+    damping: float
+    std_damping: float
+    axes: str
+    above_db: float
+    fused_hz: float
+    gnss_hz: float
+
+
+class Busy(NamedTuple):
+    """Stretch in which a point moved most: fixes t_ns, z_m, std_m and which of them the gate took, accelerations t_ns,
+    xyz, fused t_ns, d, sd."""
+
+    utc_minus_ns: int
+    fixes: tuple[I64, F64, F64]
+    taken: npt.NDArray[np.bool_]
+    accel: tuple[I64, F64]
+    fused: tuple[I64, F64, F64]
+
+
+class _Keeper:
+    """Keeps the busiest stretch of a point."""
+
+    def __init__(self) -> None:
+        self.best: Busy | None = None
+        self._score = -1.0
+        self._run = ""
+        self._begin = 0
+        self._count = 0
+        self._offset = 0
+        self._rows: dict[str, list[tuple[npt.NDArray[np.int64] | F64, ...]]] = {"fixes": [], "accel": [], "fused": []}
+        self._refused: list[I64] = []
+
+    def add(self, piece: Piece, point: str, receiver: str, accelerometer: str) -> None:
+        fixes, accel, fused = (
+            piece.fixes.get(receiver),
+            piece.accelerations.get(accelerometer),
+            piece.fused.get(point),
+        )
+        times = [p.utc_ns for p in (fixes, accel, fused) if p is not None and len(p.utc_ns)]
+        if not times:
+            return
+        first = int(min(t[0] for t in times))
+        long = first - self._begin
+        full = long >= BUSY_S[0] * S and self._count >= BUSY_FIXES[1]
+        if piece.run != self._run or full or not 0 <= long < BUSY_S[1] * S:
+            self.close()
+            self._run, self._begin, self._count = piece.run, first, 0
+        if fixes is not None:
+            good = (fixes.quality == Quality.FIXED) & np.isfinite(fixes.z_m).all(axis=1)
+            self._count += len(fixes.t_ns)
+            self._rows["fixes"].append((fixes.t_ns[good], fixes.z_m[good], fixes.std_m[good]))
+        judged = piece.judged.get(point)
+        if judged is not None:
+            self._refused.append(judged.t_ns[np.isin(judged.verdict, (Verdict.REJECTED, Verdict.OFFSET))])
+        if accel is not None and len(accel.t_ns):
+            self._offset = int(accel.utc_ns[0] - accel.t_ns[0])
+            self._rows["accel"].append((accel.t_ns, accel.xyz))
+        if fused is not None:
+            valid = np.isin(fused.mode, VALID_MODES)
+            self._rows["fused"].append(
+                (fused.utc_ns[valid], fused.displacement_m[valid], fused.std_displacement_m[valid])
+            )
+
+    def close(self) -> None:
+        rows = {k: [np.concatenate(c) for c in zip(*v, strict=True)] for k, v in self._rows.items() if v}
+        refused = np.concatenate([np.zeros(0, np.int64), *self._refused])
+        self._rows, self._refused = {"fixes": [], "accel": [], "fused": []}, []
+        if not {"fixes", "accel", "fused"} <= rows.keys() or len(rows["fixes"][0]) < BUSY_FIXES[0]:
+            return
+        t, xyz = rows["accel"]
+        good = _rising(t) & np.isfinite(xyz).all(axis=1)
+        t, xyz = t[good], xyz[good]
+        if len(t) < 100:
+            return
+        score = float(np.diff(xyz, axis=0).std(axis=0).sum()) * math.sqrt(float(t[-1] - t[0]))
+        if score > self._score:
+            fixes, fused = rows["fixes"], rows["fused"]
+            self._score = score
+            self.best = Busy(
+                self._offset,
+                (fixes[0], fixes[1], fixes[2]),
+                ~np.isin(fixes[0], refused),
+                (t, xyz),
+                (fused[0] - self._offset, fused[1], fused[2]),
+            )
+
+
+@dataclass
+class PointFigures:
+    """What a point did: coverage of the valid estimate, extremes and moments of it, spells of one mode (begin, end UTC
+    ns, mode), gate, smoothed stream, spectra, frequencies and what the sensors say of each other."""
+
+    receiver: str
+    accelerometer: str
+    valid: Stream = field(default_factory=Stream)
+    moments: Moments = field(default_factory=Moments)
+    low: list[Extreme | None] = field(default_factory=lambda: [None] * 3)
+    high: list[Extreme | None] = field(default_factory=lambda: [None] * 3)
+    spells: list[tuple[int, int, int]] = field(default_factory=list)
+    gated: int = 0
+    nis: F64 = field(default_factory=lambda: np.zeros(3))  # mean of residual^2 / variance
+    std_residual_m: F64 = field(default_factory=lambda: np.zeros(3))  # mean over the fixes at the gate
+    smoothed: Envelope = field(default_factory=lambda: Envelope(3, FINEST_NS, SPANS))
+    smoothed_std_m: Moments = field(default_factory=Moments)
+    std_m: Moments = field(default_factory=Moments)
+    fused_spectrum: spectra.Spectrum | None = None
+    gnss_spectrum: spectra.Spectrum | None = None
+    accel_spectrum: spectra.Spectrum | None = None
+    frequencies: list[Frequency] = field(default_factory=list)
+    recent: tuple[I64, F64, F64] = field(
+        default_factory=lambda: (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+    )
+    looks: dict[tuple[int, bool], Close] = field(default_factory=dict)  # axis, whether the largest
+    close: list[Close] = field(default_factory=list)
+    busy: Busy | None = None
+    agreement: Agreement | None = None
+    split: Split | None = None
+    differences: Differences | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Review:
+    """Everything that the report tells. `damaged`: file -> what is wrong with it."""
+
+    config: Config
+    config_text: str
+    configs: int  # different ones among the files
+    verdict: verify.Verdict
+    overview: Overview
+    damaged: dict[Path, str]
+    open_files: list[Path]
+    begin_ns: int
+    end_ns: int
+    points: dict[str, PointFigures]
+    latency: dict[str, Moments]
+    places: dict[str, tuple[float, float, float]]  # receiver -> latitude, longitude, height
+    rejects: dict[tuple[str, str], int]  # source, reason -> count
+
+    @property
+    def seconds(self) -> float:
+        return max((self.end_ns - self.begin_ns) / S, 1e-9)
+
+
+def gather(inputs: Sequence[Path], progress: Callable[[str], None] | None = None, smooth: bool = True) -> Review:
+    """Read files and folders. Damaged files are named in the result. OSError for a path that is not there; ReplayError
+    where no file holds data and a configuration."""
+
+    def say(text: str) -> None:
+        if progress is not None:
+            progress(text)
+
+    for path in inputs:
+        path.stat()
+    files, bad = files_of(inputs)
+    if not files:
+        told = "; ".join(f"{p}: {_short(p, why)}" for p, why in sorted(bad.items())) or "no recording there"
+        raise ReplayError(told)
+    config = configuration(files)
+    verdict = verify.verify([*files, *bad], lambda p: say(f"checking {p.name}"))
+    damaged = {p: _short(p, why) for p, why in bad.items() if not p.name.endswith(PART)}
+    unfinished = [p for p in bad if p.name.endswith(PART)]
+    for f in verdict.files:
+        if f.damage:
+            damaged.setdefault(f.path, f.damage)
+        elif f.state == "open" and f.path.name.endswith(PART):
+            if f.path not in unfinished:
+                unfinished.append(f.path)
+        elif f.state == "open":
+            damaged.setdefault(f.path, "cut off: its end is missing; what stands before is in the report")
+    held = [f for f in verdict.files if f.messages]
+    begin, end = min(f.begin_ns for f in held), max(f.end_ns for f in held)
+    texts = _configurations(files)
+    review = Review(
+        config,
+        texts[0] if texts else "",
+        len({hashlib.sha256(t.encode()).hexdigest() for t in texts}),
+        verdict,
+        Overview(),
+        damaged,
+        unfinished,
+        begin,
+        end,
+        {},
+        {},
+        {},
+        {},
+    )
+    recorded_s = sum(f.end_ns - f.begin_ns for f in held) / S
+    _walk(review, files, min(max(recorded_s / 5, SEGMENT_S[0]), SEGMENT_S[1]), smooth, say)
+    review.overview.files.update(bad)
+    for path, damage in review.overview.files.items():
+        if damage and path not in damaged and path not in unfinished:
+            damaged[path] = _short(path, damage)
+    review.places = {name: place for name in config.receivers if (place := _place(files, name)) is not None}
+    for name, p in review.points.items():
+        say(f"{name}: looking closer")
+        p.close = _close_looks(p)
+        _questions(p)
+    return review
+
+
+def _short(path: Path, why: str) -> str:
+    return why.removeprefix(f"{path}: ")
+
+
+def _configurations(files: Sequence[Path]) -> list[str]:
+    """Texts of the configurations, each different one once, in the order of the files."""
+    out: list[str] = []
+    for path in files:
+        try:
+            for a in read_attachments(path):
+                text = a.data.decode(errors="replace")
+                if a.name == CONFIG_NAME and text not in out and len(out) < 100:
+                    out.append(text)
+        except (OSError, DamagedError):
+            continue
+    return out
+
+
+def _envelopes() -> tuple[Point, Receiver, Accelerometer]:
+    """Containers with spans as fine as a plot can show."""
+
+    def fine(columns: int) -> Envelope:
+        return Envelope(columns, FINEST_NS, SPANS)
+
+    return (
+        Point(displacement=fine(3), velocity=Envelope(3, S, 200), std=fine(3), residual=fine(3), ratio=fine(1)),
+        Receiver(position=fine(3), latency=fine(1), satellites=fine(1), age=fine(1)),
+        Accelerometer(xyz=fine(3)),
+    )
+
+
+def _walk(review: Review, files: Sequence[Path], segment_s: float, smooth: bool, say: Callable[[str], None]) -> None:
+    config, overview = review.config, review.overview
+    keepers: dict[str, _Keeper] = {}
+    fused: dict[str, Averaged] = {}
+    gnss: dict[str, Averaged] = {}
+    accel: dict[str, Averaged] = {}
+    smoothers: dict[str, Smoothed] = {}
+    names = sorted(config.points)
+    total = sum(f.stat().st_size for f in files) or 1
+    done, shown = 0, ""
+    for name in names:
+        settings = config.points[name]
+        p = review.points[name] = PointFigures(settings.receiver or "", settings.accelerometer or "")
+        overview.points[name] = _envelopes()[0]
+        keepers[name], fused[name], gnss[name] = _Keeper(), Averaged(segment_s), Averaged(segment_s)
+        if smooth and p.receiver:
+            smoothers[name] = Smoothed(config, name)
+    for name in config.receivers:
+        overview.receivers[name] = _envelopes()[1]
+        review.latency[name] = Moments()
+    for name in config.accelerometers:
+        overview.accelerometers[name] = _envelopes()[2]
+        accel[name] = Averaged(segment_s)
+    current = None
+    for piece in pieces(files, config, accelerations=bool(config.accelerometers)):
+        if piece.path != current:
+            done += current.stat().st_size if current is not None else 0
+            current = piece.path
+        text = f"reading {piece.path.name}, {100 * done // total} %"
+        if text != shown:
+            say(text)
+            shown = text
+        for name in names:
+            p = review.points[name]
+            _point(p, piece, name, fused[name], gnss[name])
+            keepers[name].add(piece, name, p.receiver, p.accelerometer)
+            if name in smoothers:
+                _smooth(p, smoothers[name].add(piece))
+        for name, x in piece.fixes.items():
+            review.latency.setdefault(name, Moments()).add(x.latency_s[np.isfinite(x.latency_s)][:, None])
+        for name, a in piece.accelerations.items():
+            accel.setdefault(name, Averaged(segment_s)).add(piece.run, a.utc_ns, a.xyz)
+        overview.add(_for_overview(review, piece))
+    for name in names:
+        p = review.points[name]
+        if name in smoothers:
+            _smooth(p, smoothers[name].finish())
+        keepers[name].close()
+        p.busy = keepers[name].best
+        p.fused_spectrum, p.gnss_spectrum = fused[name].spectrum(), gnss[name].spectrum()
+        if p.accelerometer in accel:
+            p.accel_spectrum = accel[p.accelerometer].spectrum()
+            p.frequencies = _frequencies(p, accel[p.accelerometer].busiest)
+
+
+def _for_overview(review: Review, piece: Piece) -> Piece:
+    """The piece with displacement that is not valid left out, and with refused input counted instead of listed."""
+    kept: list[Happened] = []
+    for h in piece.happened:
+        if h.kind == "REJECT":
+            reason = h.text.split(":", 1)[0].split(" ", 1)[0]
+            key = h.source, reason
+            if key in review.rejects or len(review.rejects) < 200:
+                review.rejects[key] = review.rejects.get(key, 0) + int(h.values.get("count", 1.0))
+        else:
+            kept.append(h)
+    fused = {}
+    for name, f in piece.fused.items():
+        valid = np.isin(f.mode, VALID_MODES)[:, None]
+        fused[name] = dataclasses.replace(
+            f,
+            displacement_m=np.where(valid, f.displacement_m, np.nan),
+            std_displacement_m=np.where(valid, f.std_displacement_m, np.nan),
+        )
+    return dataclasses.replace(piece, happened=kept, fused=fused)
+
+
+def _point(p: PointFigures, piece: Piece, name: str, fused: Averaged, gnss: Averaged) -> None:
+    f = piece.fused.get(name)
+    if f is not None and len(f.utc_ns):
+        valid = np.isin(f.mode, VALID_MODES)
+        t, d, sd = f.utc_ns[valid], f.displacement_m[valid], f.std_displacement_m[valid]
+        p.valid.add(t)
+        p.moments.add(d)
+        p.std_m.add(sd)
+        if len(t):
+            _extremes(p, t, d, sd)
+        fused.add(piece.run, t, d)
+        _mode_spells(p, f.utc_ns, f.mode)
+    j, x = piece.judged.get(name), piece.fixes.get(p.receiver)
+    if j is None:
+        return
+    used = np.isin(j.verdict, (Verdict.ACCEPTED, Verdict.REJECTED, Verdict.OFFSET))
+    used &= (j.std_residual_m > 0).all(axis=1) & np.isfinite(j.residual_m).all(axis=1)
+    counted = used & (j.verdict == Verdict.ACCEPTED)
+    n = int(counted.sum())
+    if n:
+        total = p.gated + n
+        share = (j.residual_m[counted] / j.std_residual_m[counted]) ** 2
+        p.nis = p.nis + (share.mean(axis=0) - p.nis) * (n / total)
+        p.std_residual_m = p.std_residual_m + (j.std_residual_m[counted].mean(axis=0) - p.std_residual_m) * (n / total)
+        p.gated = total
+    if x is not None:
+        good = np.isin(x.t_ns, j.t_ns[np.isin(j.verdict, (Verdict.ACCEPTED, Verdict.START))]) & np.isfinite(x.z_m).all(
+            axis=1
+        )
+        gnss.add(piece.run, x.utc_ns[good], x.z_m[good])
+
+
+def _extremes(p: PointFigures, t: I64, d: F64, sd: F64) -> None:
+    """Take valid samples into the extremes, and keep what lies around each."""
+    t_all = np.concatenate([p.recent[0], t])
+    d_all, sd_all = np.concatenate([p.recent[1], d]), np.concatenate([p.recent[2], sd])
+    for axis in range(3):
+        lo, hi = int(np.argmin(d[:, axis])), int(np.argmax(d[:, axis]))
+        low, high = p.low[axis], p.high[axis]
+        new = {}
+        if low is None or d[lo, axis] < low.value_m:
+            p.low[axis] = new[False] = Extreme(float(d[lo, axis]), float(sd[lo, axis]), int(t[lo]))
+        if high is None or d[hi, axis] > high.value_m:
+            p.high[axis] = new[True] = Extreme(float(d[hi, axis]), float(sd[hi, axis]), int(t[hi]))
+        for upper in (False, True):
+            if upper in new:
+                at = new[upper].utc_ns
+                k = (t_all >= at - CLOSE_NS) & (t_all <= at + CLOSE_NS)
+                p.looks[axis, upper] = Close(axis, t_all[k], d_all[k, axis], sd_all[k, axis])
+                continue
+            at, look = (p.high if upper else p.low)[axis].utc_ns, p.looks[axis, upper]  # type: ignore[union-attr]
+            k = (t > look.utc_ns[-1]) & (t <= at + CLOSE_NS)
+            if k.any():
+                p.looks[axis, upper] = Close(
+                    axis,
+                    np.concatenate([look.utc_ns, t[k]]),
+                    np.concatenate([look.displacement_m, d[k, axis]]),
+                    np.concatenate([look.std_m, sd[k, axis]]),
+                )
+    kept = t_all >= t_all[-1] - CLOSE_NS
+    p.recent = t_all[kept], d_all[kept], sd_all[kept]
+
+
+def _mode_spells(p: PointFigures, t: I64, mode: U8) -> None:
+    """Spells of one mode; a gap of a second ends one."""
+    cuts = np.flatnonzero((np.diff(mode.astype(np.int64)) != 0) | (np.diff(t) > S)) + 1
+    for lo, hi in zip([0, *cuts.tolist()], [*cuts.tolist(), len(t)], strict=True):
+        begin, end, value = int(t[lo]), int(t[hi - 1]), int(mode[lo])
+        last = p.spells[-1] if p.spells else None
+        if last is not None and last[2] == value and 0 <= begin - last[1] <= S:
+            p.spells[-1] = last[0], end, value
+        elif len(p.spells) < KEPT:
+            p.spells.append((begin, end, value))
+
+
+def _smooth(p: PointFigures, blocks: object) -> None:
+    for e, offset in blocks:  # type: ignore[attr-defined]
+        valid = np.isin(e.mode, VALID_MODES)
+        p.smoothed.add(e.t_ns[valid] + offset, e.displacement_m[valid])
+        p.smoothed_std_m.add(e.std_displacement_m[valid])
+
+
+# ---------------------------------------------------------------------------------------------------------- frequencies
+
+
+def _all_peaks(s: spectra.Spectrum, axis: int, above_db: float) -> list[spectra.Peak]:
+    """Peaks of an axis. The floor is taken over a width that grows with the frequency, as modes do."""
+    step, top = float(s.freq_hz[1]), 0.9 * float(s.freq_hz[-1])
+    found: list[spectra.Peak] = []
+    for low, high, width in ((3 * step, 2.0, 0.4), (2.0, top, 2.0)):
+        if low < min(high, top):
+            w = max(width, 12 * step)
+            found += spectra.peaks(s, axis, low_hz=low, high_hz=min(high, top), above_db=above_db, width_hz=w)
+    return found
+
+
+def _same(a_hz: float, b_hz: float, step_hz: float) -> bool:
+    return abs(a_hz - b_hz) <= max(SAME * a_hz, SAME_LINES * step_hz)
+
+
+def _frequencies(p: PointFigures, stretch: spectra.Uniform | None) -> list[Frequency]:
+    s = p.accel_spectrum
+    if s is None or stretch is None:
+        return []
+    step = float(s.freq_hz[1])
+    groups: list[list[tuple[spectra.Peak, int]]] = []
+    every = sorted((peak, axis) for axis in range(3) for peak in _all_peaks(s, axis, PEAK_DB))
+    for peak, axis in every:
+        if groups and _same(groups[-1][-1][0].freq_hz, peak.freq_hz, step):
+            groups[-1].append((peak, axis))
+        else:
+            groups.append([(peak, axis)])
+    groups.sort(key=lambda g: -max(peak.above_db for peak, _ in g))
+    groups = sorted(groups[:MODES], key=lambda g: g[0][0].freq_hz)
+    other = [
+        [peak.freq_hz for axis in range(3) for peak in _all_peaks(o, axis, spectra.BOTTOM_DB)] if o is not None else []
+        for o in (p.fused_spectrum, p.gnss_spectrum)
+    ]
+    tops = [max(g, key=lambda row: row[0].above_db) for g in groups]
+    out = []
+    for i, (peak, axis) in enumerate(tops):
+        apart = min((abs(peak.freq_hz - t[0].freq_hz) for k, t in enumerate(tops) if k != i), default=math.inf)
+        width = min(max(0.15 * peak.freq_hz, 8 * step), 0.6 * apart, 0.9 * peak.freq_hz)
+        mode = spectra.NO_MODE
+        if stretch.valid.mean() > 0.98:
+            mode = spectra.fit_mode(stretch.x[:, axis], stretch.rate_hz, peak.freq_hz, width, accelerations=True)
+        if not _same(peak.freq_hz, mode.freq_hz, step):
+            mode = spectra.NO_MODE
+        near = [
+            min(
+                (f for f in found if _same(peak.freq_hz, f, step)),
+                key=lambda f: abs(f - peak.freq_hz),
+                default=math.nan,
+            )
+            for found in other
+        ]
+        fitted = math.isfinite(mode.freq_hz)
+        out.append(
+            Frequency(
+                mode.freq_hz if fitted else peak.freq_hz,
+                mode.std_freq_hz,
+                mode.damping,
+                mode.std_damping,
+                "".join("xyz"[a] for a in sorted({a for _, a in groups[i]})),
+                peak.above_db,
+                near[0],
+                near[1],
+            )
+        )
+    return out
+
+
+# --------------------------------------------------------------------------------------------------------- closer looks
+
+
+def _close_looks(p: PointFigures) -> list[Close]:
+    """Full-rate samples around the furthest displacement of each axis from its mean."""
+    out = []
+    for axis in range(3):
+        low, high, mean = p.low[axis], p.high[axis], float(p.moments.mean[axis])
+        if low is not None and high is not None:
+            out.append(p.looks[axis, high.value_m - mean > mean - low.value_m])
+    return out
+
+
+def _place(files: Sequence[Path], receiver: str) -> tuple[float, float, float] | None:
+    """The first position that a receiver gave."""
+    topic = f"/gnss/{receiver}/solution"
+    for path in files[:20]:
+        try:
+            s = next(read_messages(path, {topic}), None)
+        except (OSError, DamagedError):
+            continue
+        if s is not None:
+            v = topics.decode(s.schema, s.data)
+            return float(v["latitude_deg"]), float(v["longitude_deg"]), float(v["height_m"])
+    return None
+
+
+def _questions(p: PointFigures) -> None:
+    """What needs all samples at once, asked of the busiest minutes."""
+    if p.busy is None:
+        return
+    t, z, std = p.busy.fixes
+    good = _rising(t)
+    if p.busy.taken.mean() > TRUSTED:
+        good &= p.busy.taken
+    t, z, std = t[good], z[good], std[good]
+    fixes = plain(t, z, np.where(np.isfinite(std) & (std > 0), std, 0.01))
+    accel = Accelerations(*p.busy.accel)
+    try:
+        p.agreement = agree(fixes, accel)
+    except ValueError as e:
+        p.notes.append(f"sensors not compared: {e}")
+    try:
+        p.split = split_fusion(fixes, accel)
+    except ValueError as e:
+        p.notes.append(f"not split by frequency: {e}")
+    t_f, d, _ = p.busy.fused
+    good = _rising(t_f)
+    t_f, d = t_f[good], d[good]
+    if len(t_f) > 200 and p.frequencies:
+        top = S / float(np.median(np.diff(t_f))) / 4
+        low = 0.5 * p.frequencies[0].freq_hz
+        if low < 0.5 * top:
+            p.differences = second_difference(t_f, d, accel, low, min(top, 1.5 * p.frequencies[-1].freq_hz))
+
+
+def modes_of(p: Point) -> dict[str, float]:
+    """Share of samples in each mode."""
+    total = sum(p.modes.values()) or 1
+    return {Mode(k).name: n / total for k, n in sorted(p.modes.items())}
+
+
+def gaps_of(review: Review, stream: Stream) -> list[tuple[int, int, str]]:
+    """Silences of a stream with reasons, from the begin of the record to its end."""
+    known = [(g.begin_ns, g.end_ns, g.reason) for g in review.verdict.gaps]
+    return [(s.begin_ns, s.end_ns, s.reason) for s in review.overview.why(stream, known)]
+
+
+__all__ = ["ReplayError", "Review", "gather"]

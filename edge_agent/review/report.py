@@ -1,0 +1,103 @@
+"""`edge-agent review`: the panels on one page that needs nothing but itself.
+
+No address outside the file is in it; script and style stand inside (page.css, page.js beside this module). Conclusions
+come first, then what went wrong, then the panels. On paper every panel keeps together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from html import escape
+from importlib.resources import files as package_files
+from pathlib import Path
+from typing import Any
+
+from edge_agent.review.charts import length, utc
+from edge_agent.review.figures import as_json, availability_of, conclusions, findings
+from edge_agent.review.gather import Review, gather
+from edge_agent.review.panels import AXES, PANELS, mm, number, percent, quality_name
+
+LEVELS = ("doubt", "lost", "known")
+
+
+def page(r: Review) -> str:
+    """The whole page."""
+    here = package_files("edge_agent.review")
+    css, js = (here.joinpath(n).read_text(encoding="utf-8") for n in ("page.css", "page.js"))
+    sections, links = [], []
+    for panel in PANELS:
+        body = panel.draw(r)
+        if body:
+            sections.append(f'<section id="{panel.key}"><h2>{escape(panel.title)}</h2>{body}</section>')
+            links.append(f'<a href="#{panel.key}">{escape(panel.title)}</a>')
+    found = findings(r)
+    trouble = (
+        "".join(f'<li class="{LEVELS[f.level]}">{escape(f.text)}.</li>' for f in found)
+        or "<li class=fine>Nothing: no gap, no loss, no jump, no damaged file.</li>"
+    )
+    said = "".join(f"<li>{escape(t)}</li>" for t in conclusions(r))
+    title = f"{r.config.site}: review of {utc(r.begin_ns)[:10]}"
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<link rel="icon" href="data:,"><title>{escape(title)}</title><style>{css}</style></head><body><main>'
+        f"<header><h1>{escape(r.config.site)}</h1><p>Displacement review, {utc(r.begin_ns)} to {utc(r.end_ns)} UTC</p>"
+        f'</header><div class="cards">{_cards(r)}</div>'
+        f'<section id="summary"><h2>Summary</h2><ul>{said}</ul><h3>What went wrong</h3><ul class="trouble">{trouble}'
+        f"</ul></section><nav>{''.join(links)}</nav>{''.join(sections)}"
+        f"<footer>Made by edge-agent review from {len(r.verdict.files)} files. All times UTC; sd = standard deviation. "
+        f"</footer></main><script>{js}</script></body></html>\n"
+    )
+
+
+def _cards(r: Review) -> str:
+    out = [("Period", length(r.seconds), f"{utc(r.begin_ns)[:16]} UTC")]
+    for name, p in list(r.points.items())[:4]:
+        if not p.moments.n:
+            out.append((f"{name}", "no valid displacement", ""))
+            continue
+        out.append((f"{name}: availability", percent(availability_of(r, p)), "valid displacement"))
+        moved = [
+            (hi.value_m - lo.value_m, i, lo, hi)
+            for i, (lo, hi) in enumerate(zip(p.low, p.high, strict=True))
+            if lo and hi
+        ]
+        size, i, lo, hi = max(moved)
+        sd = math.hypot(lo.std_m, hi.std_m)
+        out.append((f"{name}: largest range", f"{mm(size)} \u00b1 {mm(sd)} mm", f"axis {AXES[i]}"))
+        if p.frequencies:
+            f = p.frequencies[0]
+            more = len(p.frequencies) - 1
+            out.append((f"{name}: lowest frequency", f"{number(f.freq_hz, 3)} Hz", f"{more} more" if more else "alone"))
+    for name, x in list(r.overview.receivers.items())[:2]:
+        if x.stream.samples:
+            q, n = max(x.qualities.items(), key=lambda row: row[1])
+            out.append(
+                (
+                    f"{name}: fixes",
+                    f"{percent(n / x.stream.samples)} {quality_name(q).lower()}",
+                    f"{x.stream.samples} fixes",
+                )
+            )
+    return "".join(
+        f"<div><span>{escape(a)}</span><b>{escape(b)}</b><small>{escape(c)}</small></div>" for a, b, c in out
+    )
+
+
+def review(
+    inputs: Sequence[Path], output: Path | None, progress: Callable[[str], None] | None = None
+) -> tuple[Review, dict[str, Any]]:
+    """Read recordings, write the page (None: none), return what was gathered and its JSON twin. Raises as `gather`."""
+    gathered = gather(inputs, progress)
+    if output is not None:
+        part = output.with_name(output.name + ".part")
+        part.write_text(page(gathered), encoding="utf-8")
+        part.replace(output)
+    return gathered, as_json(gathered)
+
+
+def as_text(r: Review) -> str:
+    """For people on a terminal: the page's first words."""
+    lines = [*conclusions(r), *(f"{('WRONG', 'LOSS', 'note')[f.level]}: {f.text}" for f in findings(r))]
+    return "\n".join(lines)

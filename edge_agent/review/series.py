@@ -1,0 +1,648 @@
+"""Recordings -> arrays, piece by piece in the order of the files, and a summary of any length in bounded memory.
+
+`pieces` walks over files and hands out at most PIECE_S seconds at a time: fused blocks, fixes, verdicts, events, faults
+as recorded; accelerations from `/accel/<id>/block` where that was recorded, else decoded from the raw frames by the
+path's own codec and clock, set to the state of the segment's checkpoint. A file that is damaged or empty ends its walk
+and is named in `Piece.damage`; the others go on.
+
+`Overview` takes pieces and keeps envelopes (the least and largest value of every span: no extreme is ever lost, and
+where nothing was there is no span), counts, gaps with their reasons and the events. Times here are UTC ns, for the
+monotonic clock begins anew with each boot. Left out: mathematics (smooth, spectra, ...), drawing (report).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from edge_agent import assemble
+from edge_agent.geodesy import Frame
+from edge_agent.messages import F64, I64, U8, AccelFlag, CanFrames, Config, Quality, S, Verdict
+from edge_agent.pipeline import Pipeline
+from edge_agent.recording import topics
+from edge_agent.recording.reader import DamagedError, Stored, read_messages, read_metadata
+from edge_agent.recording.writer import RUN_METADATA
+from edge_agent.replay import ReplayError, in_order, recorded_config
+from edge_agent.review.columns import groups
+from edge_agent.review.smooth import Accelerations, Fixes, plain
+from edge_agent.timebase import with_times
+
+PIECE_S = 60.0
+"""Seconds of a piece: 8 points at 250 Hz are 15 MB."""
+FRAMES_NS = S // 2
+"""Raw frames are decoded so much at a time: the same samples as live, their fitted times within the clock's own sd."""
+SPANS = 4000
+"""Spans of an envelope at most: two for each pixel of a wide screen."""
+KEPT = 5000
+"""Events and gaps kept at most; what is beyond is counted."""
+
+
+# --------------------------------------------------------------------------------------------------------------- pieces
+
+
+@dataclass(frozen=True, slots=True)
+class Fused:
+    """The live stream of a point: utc_ns (n,), displacement, velocity and their sd (n, 3), mode, flags (n,)."""
+
+    utc_ns: I64
+    displacement_m: F64
+    velocity_mps: F64
+    std_displacement_m: F64
+    std_velocity_mps: F64
+    mode: U8
+    flags: U8
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed:
+    """Fixes of a receiver: utc_ns (n,), t_ns (n,) monotonic, z_m (n, 3) in structure axes about the point's zero, NaN
+    before there is a reference, std_m (n, 3) declared, quality, satellites (n,), latency_s, age_s (n,)."""
+
+    utc_ns: I64
+    t_ns: I64
+    z_m: F64
+    std_m: F64
+    quality: U8
+    satellites: I64
+    latency_s: F64
+    age_s: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """The gate's words on the fixes of a point: utc_ns, t_ns (n,), residual_m with its sd, std_m of the fix as used,
+    offset_m (n, 3), ratio, verdict (n,)."""
+
+    utc_ns: I64
+    t_ns: I64
+    residual_m: F64
+    std_residual_m: F64
+    std_m: F64
+    offset_m: F64
+    ratio: F64
+    verdict: U8
+
+
+@dataclass(frozen=True, slots=True)
+class Accelerated:
+    """Samples of an accelerometer: utc_ns, t_ns (n,), xyz (n, 3) m/s2, flags (n,) of AccelFlag."""
+
+    utc_ns: I64
+    t_ns: I64
+    xyz: F64
+    flags: U8
+
+
+class Happened(NamedTuple):
+    """An event or fault: UTC of its begin and end, monotonic time, kind, source, text, values."""
+
+    begin_ns: int
+    end_ns: int
+    t_ns: int
+    kind: str
+    source: str
+    text: str
+    values: dict[str, float]
+    fault: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """What one file holds of some seconds. `first`: begins a file; `run`: the agent's run; `missing`: raw blocks that
+    are not there before or in this piece; `damage`: why the file ends here, "" = it does not."""
+
+    path: Path
+    run: str
+    first: bool
+    fused: dict[str, Fused]
+    fixes: dict[str, Fixed]
+    judged: dict[str, Judged]
+    accelerations: dict[str, Accelerated]
+    happened: list[Happened]
+    missing: int = 0
+    damage: str = ""
+
+
+def configuration(paths: Sequence[Path]) -> Config:
+    """The first configuration that is attached to a file. ReplayError where none is."""
+    for path in paths:
+        try:
+            return recorded_config(path)
+        except (OSError, DamagedError, ReplayError):
+            continue
+    raise ReplayError(f"no configuration in {', '.join(str(p) for p in paths) or 'nothing'}")
+
+
+def files_of(inputs: Sequence[Path]) -> tuple[list[Path], dict[Path, str]]:
+    """Files among inputs (folders expanded) in order of time, and those that hold nothing with the reason."""
+    good: list[Path] = []
+    bad: dict[Path, str] = {}
+    for path in inputs:
+        for file in sorted(p for p in path.iterdir() if ".mcap" in p.suffixes) if path.is_dir() else [path]:
+            try:
+                if file.stat().st_size == 0:
+                    bad[file] = "empty"
+                elif next(read_messages(file), None) is None:
+                    bad[file] = "holds no message"
+                else:
+                    read_metadata(file)
+                    good.append(file)
+            except (OSError, DamagedError) as e:
+                bad[file] = str(e)
+    return (in_order(good) if good else []), bad
+
+
+def pieces(
+    files: Sequence[Path], config: Config, *, accelerations: bool = True, piece_s: float = PIECE_S
+) -> Iterator[Piece]:
+    """Walk over files in the given order."""
+    for path in files:
+        yield from _File(path, config, accelerations, round(piece_s * S)).walk()
+
+
+def window(
+    files: Sequence[Path], point: str, *, begin_ns: int = -(1 << 62), end_ns: int = 1 << 62
+) -> tuple[Fixes, Accelerations]:
+    """What both sensors of a point said between two UTC times, all in memory: fixed solutions as declared, by their
+    first run's monotonic clock, and accelerations. For `agree`, `split_fusion`, `second_difference`.
+
+    ReplayError without a configuration, KeyError for a point that it does not name."""
+    config = configuration(files)
+    settings = config.points[point]
+    rows: dict[str, list[tuple[Any, ...]]] = {"fixes": [], "accel": []}
+    run: str | None = None
+    for piece in pieces(files, config, accelerations=settings.accelerometer is not None):
+        fixes = piece.fixes.get(settings.receiver or "")
+        accel = piece.accelerations.get(settings.accelerometer or "")
+        for kind, part in (("fixes", fixes), ("accel", accel)):
+            if part is None:
+                continue
+            inside = (part.utc_ns >= begin_ns) & (part.utc_ns < end_ns)
+            if inside.any() and run is None:
+                run = piece.run
+            if not inside.any() or piece.run != run:
+                continue
+            if isinstance(part, Fixed):
+                inside &= (part.quality == Quality.FIXED) & np.isfinite(part.z_m).all(axis=1)
+                rows[kind].append((part.t_ns[inside], part.z_m[inside], part.std_m[inside]))
+            else:
+                rows[kind].append((part.t_ns[inside], part.xyz[inside]))
+    t, z, std = _together(rows["fixes"], 3)
+    t_a, xyz = _together(rows["accel"], 2)
+    rising = np.diff(t_a, prepend=t_a[:1] - 1) > 0
+    return plain(t, z, np.where(np.isfinite(std) & (std > 0), std, 0.01)), Accelerations(t_a[rising], xyz[rising])
+
+
+def _together(rows: list[tuple[Any, ...]], count: int) -> list[Any]:
+    if not rows:
+        return [np.zeros(0, np.int64), *(np.zeros((0, 3)) for _ in range(count - 1))]
+    return [np.concatenate(c) for c in zip(*rows, strict=True)]
+
+
+class _File:
+    """One file's walk: rows wait in lists until the piece is long enough."""
+
+    def __init__(self, path: Path, config: Config, accelerations: bool, span_ns: int) -> None:
+        self.path, self.config, self.span_ns = path, config, span_ns
+        try:
+            self.run = read_metadata(path).get(RUN_METADATA, {}).get("run", "")
+        except (OSError, DamagedError):
+            self.run = ""
+        self.decode_raw = accelerations
+        self.pipeline: Pipeline = assemble.pipeline(config)
+        self.axes = Frame((0.0, 0.0, 0.0), config.structure.azimuth_deg)
+        unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+        self.turn = np.array([self.axes.to_structure(e) for e in unit]).T
+        self.zero = {name: np.zeros(3) for name in config.receivers}
+        self.order: int | None = None
+        self.waiting: dict[str, list[tuple[CanFrames, int, int]]] = {}  # port -> frames, UTC - monotonic, their time
+        self.first = True
+        self._new()
+
+    def _new(self) -> None:
+        self.begin_ns = -1
+        self.rows: dict[tuple[str, str], list[tuple[Any, ...]]] = {}
+        self.kept: dict[tuple[str, str], list[Stored]] = {}
+        self.happened: list[Happened] = []
+        self.missing = 0
+
+    def walk(self) -> Iterator[Piece]:
+        damage = ""
+        try:
+            for stored in read_messages(self.path):
+                if self.begin_ns < 0:
+                    self.begin_ns = stored.log_ns
+                elif not 0 <= stored.log_ns - self.begin_ns < self.span_ns:
+                    yield self._piece("")
+                    self.begin_ns = stored.log_ns
+                self._take(stored)
+        except (OSError, ValueError) as e:  # what no longer decodes is damage too
+            damage = str(e)
+        self._frames()  # at the end only: where a piece ends must not move the clocks
+        yield self._piece(damage)
+
+    def _take(self, s: Stored) -> None:
+        if s.topic == topics.CHECKPOINT_TOPIC:
+            self._checkpoint(s)
+        elif s.topic.startswith(topics.RAW_PREFIX):
+            self._raw(s)
+        elif s.topic in ("/events", "/faults"):
+            self._event(s)
+        else:
+            match s.topic.split("/"):
+                case ["", "fusion", point, "block"]:
+                    self._keep("fused", point, s)
+                case ["", "fusion", point, "update"]:
+                    self._keep("judged", point, s)
+                case ["", "gnss", receiver, "solution"]:
+                    self._keep("fixes", receiver, s)
+                case ["", "accel", name, "block"]:
+                    b = topics.decode_accel_block(name, s.data)
+                    self.decode_raw = False  # recorded at full rate: nothing to compute again
+                    offset = s.publish_ns - int(b.t_ns[0])
+                    self._put("accel", name, b.t_ns + offset, b.t_ns, b.xyz, b.flags)
+
+    def _checkpoint(self, s: Stored) -> None:
+        point = topics.decode_checkpoint(s.data)
+        try:
+            self.pipeline.load(point.state)
+        except ValueError:  # another version's or other settings': codecs begin anew, which costs a moment
+            self.pipeline = assemble.pipeline(self.config)
+        for name in self.zero:
+            self.zero[name] = np.array(self.pipeline.station.datum(name) or (0.0, 0.0, 0.0))
+
+    def _raw(self, s: Stored) -> None:
+        order = topics.raw_order(s.schema, s.data)
+        if self.order is not None and order > self.order + 1:
+            self.missing += order - self.order - 1
+        self.order = order
+        if not self.decode_raw or s.schema != topics.CAN_FRAMES:
+            return
+        raw = topics.decode_raw(s.topic, s.schema, s.data)
+        if isinstance(raw.payload, CanFrames):
+            offset = s.log_ns - raw.t_ns  # the segment's map
+            wait = self.waiting.setdefault(raw.source, [])
+            if wait and (wait[0][1] != offset or raw.t_ns - wait[0][2] > FRAMES_NS):
+                self._frames(raw.source)
+                wait = self.waiting.setdefault(raw.source, [])
+            wait.append((raw.payload, offset, raw.t_ns))
+
+    def _frames(self, port: str | None = None) -> None:
+        """Decode the frames that wait, of one port or of all."""
+        for source in [port] if port is not None else list(self.waiting):
+            wait = self.waiting.pop(source, [])
+            if not wait:
+                continue
+            frames = _joined([w[0] for w in wait])
+            for name, accelerometer in self.pipeline.accelerometers.items():
+                if accelerometer.settings.port != source:
+                    continue
+                block, _ = accelerometer.codec.feed(frames)
+                if block is None or not block.t_ns.size:
+                    continue
+                t_ns, gap = accelerometer.clock.times(block)
+                block = with_times(block, t_ns, t_ns is not block.t_ns, gap)
+                self._put("accel", name, block.t_ns + wait[0][1], block.t_ns, block.xyz, block.flags)
+
+    def _keep(self, kind: str, name: str, s: Stored) -> None:
+        self.kept.setdefault((kind, name), []).append(s)
+
+    def _decode(self, kind: str, name: str) -> None:
+        """Turn kept messages of one topic into rows."""
+        messages = self.kept.pop((kind, name), [])
+        if not messages:
+            return
+        publish = np.array([m.publish_ns for m in messages], np.int64)
+        for group in groups(messages[0].schema, [m.data for m in messages]):
+            c, utc = group.columns, publish[group.rows]
+            t = c["monotonic_ns"][:, 0]
+            if kind == "fused":
+                after = c["t_offset_ns"]
+                three = (
+                    np.stack([c[f"{what}_{axis}_{unit}"].reshape(-1) for axis in "xyz"], axis=1).astype(np.float64)
+                    for what, unit in (
+                        ("displacement", "m"),
+                        ("velocity", "mps"),
+                        ("std_displacement", "m"),
+                        ("std_velocity", "mps"),
+                    )
+                )
+                self._put(
+                    kind,
+                    name,
+                    (utc[:, None] + after).reshape(-1),
+                    *three,
+                    c["mode"].reshape(-1),
+                    c["flags"].reshape(-1),
+                )
+            elif kind == "judged":
+                three = (_three(c, k) for k in ("residual_m", "std_residual_m", "std_fix_m", "offset_m"))
+                self._put(kind, name, utc, t, *three, c["ratio"][:, 0].astype(np.float64), c["verdict"][:, 0])
+            else:
+                enu = np.stack([c[k][:, 0] for k in ("east_m", "north_m", "up_m")], axis=1)
+                z = enu @ self.turn.T - self.zero.get(name, np.zeros(3))
+                std = _three(c, "std_enu_m")
+                std = np.array([self.axes.std_to_structure((e, n, u)) for e, n, u in std.tolist()])
+                self._put(
+                    kind, name, utc, t, z, std, c["fix"][:, 0], c["satellites"][:, 0].astype(np.int64),
+                    c["latency_ns"][:, 0] / S, c["age_s"][:, 0].astype(np.float64),
+                )  # fmt: skip
+
+    def _event(self, s: Stored) -> None:
+        d = topics.decode(s.schema, s.data)
+        values = {v["name"]: float(v["value"]) for v in d["values"]}
+        begin, end = (d[k]["sec"] * S + d[k]["nanosec"] for k in ("begin", "end"))
+        fault = s.topic == "/faults"
+        self.happened.append(Happened(begin, end, d["monotonic_ns"], d["kind"], d["source"], d["text"], values, fault))
+        if d["kind"] == "REFERENCE" and d["source"] in self.zero and {"x_m", "y_m", "z_m"} <= values.keys():
+            self._decode("fixes", d["source"])  # those before count from the old zero
+            self.zero[d["source"]] = np.array([values["x_m"], values["y_m"], values["z_m"]])
+
+    def _put(self, kind: str, name: str, *columns: Any) -> None:
+        self.rows.setdefault((kind, name), []).append(columns)
+
+    def _piece(self, damage: str) -> Piece:
+        for kind, name in list(self.kept):
+            self._decode(kind, name)
+
+        def joined(kind: str) -> dict[str, list[Any]]:
+            out = {}
+            for (k, name), rows in self.rows.items():
+                if k == kind:
+                    columns = [np.concatenate(c) for c in zip(*rows, strict=True)]
+                    order = np.argsort(columns[0], kind="stable")  # groups of messages came one after the other
+                    out[name] = [c[order] for c in columns]
+            return out
+
+        piece = Piece(
+            self.path,
+            self.run,
+            self.first,
+            {k: Fused(*c) for k, c in joined("fused").items()},
+            {k: Fixed(*c) for k, c in joined("fixes").items()},
+            {k: Judged(*c) for k, c in joined("judged").items()},
+            {k: Accelerated(*c) for k, c in joined("accel").items()},
+            self.happened,
+            self.missing,
+            damage,
+        )
+        self.first = False
+        self._new()
+        return piece
+
+
+def _three(c: dict[str, Any], name: str) -> F64:
+    return np.concatenate([c[f"{name}.{axis}"] for axis in "xyz"], axis=1).astype(np.float64)
+
+
+def _joined(blocks: list[CanFrames]) -> CanFrames:
+    """Blocks of one port as one; narrow ones are filled with zeros."""
+    if len(blocks) == 1:
+        return blocks[0]
+    width = max(b.data.shape[1] for b in blocks)
+    data = [
+        b.data if b.data.shape[1] == width else np.pad(b.data, ((0, 0), (0, width - b.data.shape[1]))) for b in blocks
+    ]
+    return CanFrames(
+        np.concatenate([b.t_ns for b in blocks]),
+        np.concatenate([b.can_id for b in blocks]),
+        np.concatenate([b.flags for b in blocks]),
+        np.concatenate([b.length for b in blocks]),
+        np.concatenate(data),
+        sum(b.dropped for b in blocks),
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------- overview
+
+
+class Envelope:
+    """Least and largest value of every span of time, for columns (c,). Spans double in length when there are too many,
+    so memory is bounded and every extreme stays."""
+
+    def __init__(self, columns: int, span_ns: int = S, most: int = SPANS) -> None:
+        self.span_ns, self.most = span_ns, most
+        self._key: I64 = np.zeros(0, np.int64)
+        self._low: F64 = np.zeros((0, columns))
+        self._high: F64 = np.zeros((0, columns))
+        self._count: I64 = np.zeros(0, np.int64)
+
+    def add(self, utc_ns: I64, values: F64) -> None:
+        """Samples (n,), (n, c) or (n,) values; NaN values count as nothing."""
+        if not len(utc_ns):
+            return
+        columns = values.reshape(len(utc_ns), -1)
+        count = np.ones(len(utc_ns), np.int64)
+        low, high = np.where(np.isnan(columns), np.inf, columns), np.where(np.isnan(columns), -np.inf, columns)
+        key = utc_ns // self.span_ns
+        self._merge(
+            np.concatenate([self._key, key]),
+            np.concatenate([self._low, low]),
+            np.concatenate([self._high, high]),
+            np.concatenate([self._count, count]),
+        )
+        while len(self._key) > self.most:
+            self.span_ns *= 2
+            self._merge(self._key // 2, self._low, self._high, self._count)
+
+    def _merge(self, key: I64, low: F64, high: F64, count: I64) -> None:
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+        starts = np.flatnonzero(np.diff(key, prepend=key[0] - 1))
+        self._key = key[starts]
+        self._low = np.minimum.reduceat(low[order], starts, axis=0)
+        self._high = np.maximum.reduceat(high[order], starts, axis=0)
+        self._count = np.add.reduceat(count[order], starts)
+
+    def spans(self) -> tuple[I64, F64, F64, I64]:
+        """Middles (k,) UTC ns of the spans that hold something; low, high (k, c), NaN where only NaN was; count."""
+        low, high = (np.where(np.isfinite(v), v, np.nan) for v in (self._low, self._high))
+        return self._key * self.span_ns + self.span_ns // 2, low, high, self._count
+
+
+class Silence(NamedTuple):
+    """A stretch of a stream without data, UTC ns, and why."""
+
+    begin_ns: int
+    end_ns: int
+    reason: str
+
+
+class Stream:
+    """Coverage of one stream: how many samples, the usual interval, and where it was silent."""
+
+    def __init__(self, least_s: float = 1.0) -> None:
+        self.samples = 0
+        self.begin_ns = self.end_ns = -1
+        self.usual_ns = 0.0
+        self.covered_ns = 0
+        self.silences: list[tuple[int, int]] = []
+        self.more = 0  # silences beyond the list, the shortest ones
+        self._least_ns = round(least_s * S)
+
+    def add(self, utc_ns: I64) -> None:
+        if not len(utc_ns):
+            return
+        before = utc_ns[:1] if self.end_ns < 0 else np.array([self.end_ns])
+        steps = np.diff(utc_ns, prepend=before)
+        inner = steps[steps > 0]
+        if len(inner) and not self.usual_ns:
+            self.usual_ns = float(np.median(inner))
+        limit = max(self._least_ns, 3.5 * self.usual_ns)
+        for i in np.flatnonzero(steps > limit).tolist():
+            self.silences.append((int(utc_ns[i] - steps[i]), int(utc_ns[i])))
+        if len(self.silences) > 2 * KEPT:
+            self.silences.sort(key=lambda s: s[0] - s[1])
+            self.more += len(self.silences) - KEPT
+            self.silences = self.silences[:KEPT]
+        self.covered_ns += int(steps[(steps > 0) & (steps <= limit)].sum())
+        if self.begin_ns < 0:
+            self.begin_ns = int(utc_ns[0])
+        self.end_ns = max(self.end_ns, int(utc_ns[-1]))
+        self.samples += len(utc_ns)
+
+
+@dataclass
+class Point:
+    """What a point did. Envelopes in m, m/s: displacement, velocity, sd of displacement; of the gate: residual,
+    ratio."""
+
+    stream: Stream = field(default_factory=lambda: Stream())
+    displacement: Envelope = field(default_factory=lambda: Envelope(3))
+    velocity: Envelope = field(default_factory=lambda: Envelope(3))
+    std: Envelope = field(default_factory=lambda: Envelope(3))
+    residual: Envelope = field(default_factory=lambda: Envelope(3))
+    ratio: Envelope = field(default_factory=lambda: Envelope(1))
+    modes: dict[int, int] = field(default_factory=dict)  # samples per Mode
+    verdicts: dict[int, int] = field(default_factory=dict)  # fixes per Verdict
+    over: int = 0  # fixes at the gate with a ratio above 1
+
+
+@dataclass
+class Receiver:
+    """What a receiver said: fixes per quality, and the quality over time (columns: the quality's number)."""
+
+    stream: Stream = field(default_factory=lambda: Stream())
+    position: Envelope = field(default_factory=lambda: Envelope(3))
+    latency: Envelope = field(default_factory=lambda: Envelope(1))
+    satellites: Envelope = field(default_factory=lambda: Envelope(1))
+    age: Envelope = field(default_factory=lambda: Envelope(1))
+    qualities: dict[int, int] = field(default_factory=dict)
+    spells: list[tuple[int, int, int]] = field(default_factory=list)  # begin, end UTC ns, quality; the first KEPT
+
+
+@dataclass
+class Accelerometer:
+    """What an accelerometer said: envelope in m/s2, samples per flag."""
+
+    stream: Stream = field(default_factory=lambda: Stream(0.5))
+    xyz: Envelope = field(default_factory=lambda: Envelope(3))
+    flags: dict[int, int] = field(default_factory=dict)  # samples per AccelFlag
+
+
+class Overview:
+    """Everything that a report tells of any length of recordings. `add` each piece; then read the fields and `why`."""
+
+    def __init__(self) -> None:
+        self.points: dict[str, Point] = {}
+        self.receivers: dict[str, Receiver] = {}
+        self.accelerometers: dict[str, Accelerometer] = {}
+        self.happened: list[Happened] = []
+        self.kinds: dict[str, int] = {}
+        self.files: dict[Path, str] = {}  # damage, "" = none
+        self.runs: list[str] = []
+        self.missing = 0
+
+    def add(self, piece: Piece) -> None:
+        self.files[piece.path] = piece.damage or self.files.get(piece.path, "")
+        if piece.run not in self.runs:
+            self.runs.append(piece.run)
+        self.missing += piece.missing
+        for h in piece.happened:
+            self.kinds[h.kind] = self.kinds.get(h.kind, 0) + 1
+            if len(self.happened) < KEPT:
+                self.happened.append(h)
+        for name, f in piece.fused.items():
+            p = self.points.setdefault(name, Point())
+            p.stream.add(f.utc_ns)
+            p.displacement.add(f.utc_ns, f.displacement_m)
+            p.velocity.add(f.utc_ns, f.velocity_mps)
+            p.std.add(f.utc_ns, f.std_displacement_m)
+            _count(p.modes, f.mode)
+        for name, j in piece.judged.items():
+            p = self.points.setdefault(name, Point())
+            gated = np.isin(j.verdict, (Verdict.ACCEPTED, Verdict.REJECTED, Verdict.OFFSET))
+            p.residual.add(j.utc_ns[gated], j.residual_m[gated])
+            p.ratio.add(j.utc_ns[gated], j.ratio[gated])
+            p.over += int((j.ratio[gated] > 1.0).sum())
+            _count(p.verdicts, j.verdict)
+        for name, x in piece.fixes.items():
+            r = self.receivers.setdefault(name, Receiver())
+            r.stream.add(x.utc_ns)
+            for envelope, values in ((r.position, x.z_m), (r.latency, x.latency_s), (r.age, x.age_s)):
+                envelope.add(x.utc_ns, values)
+            r.satellites.add(x.utc_ns, x.satellites.astype(np.float64))
+            _count(r.qualities, x.quality)
+            self._spells(r, x)
+        for name, a in piece.accelerations.items():
+            s = self.accelerometers.setdefault(name, Accelerometer())
+            s.stream.add(a.utc_ns)
+            s.xyz.add(a.utc_ns, a.xyz)
+            for flag in AccelFlag:
+                hit = int(((a.flags & flag.value) != 0).sum())
+                if hit:
+                    s.flags[flag.value] = s.flags.get(flag.value, 0) + hit
+
+    @staticmethod
+    def _spells(r: Receiver, x: Fixed) -> None:
+        """Spells of one quality; a silence ends one."""
+        if not len(x.utc_ns):
+            return
+        limit = max(S, round(3.5 * r.stream.usual_ns))
+        parts = np.flatnonzero(
+            (np.diff(x.quality, prepend=x.quality[:1]) != 0) | (np.diff(x.utc_ns, prepend=x.utc_ns[:1]) > limit)
+        )
+        for lo, hi in zip([0, *parts.tolist()], [*parts.tolist(), len(x.quality)], strict=True):
+            if hi <= lo:
+                continue
+            begin, end, quality = int(x.utc_ns[lo]), int(x.utc_ns[hi - 1]), int(x.quality[lo])
+            last = r.spells[-1] if r.spells else None
+            if last is not None and last[2] == quality and 0 <= begin - last[1] <= limit:
+                r.spells[-1] = last[0], end, quality
+            elif len(r.spells) < KEPT:
+                r.spells.append((begin, end, quality))
+
+    def why(self, stream: Stream, known: Sequence[tuple[int, int, str]] = ()) -> list[Silence]:
+        """The silences of a stream in order of time with their reasons: a known gap of the raw data (begin, end UTC ns,
+        reason: `verify`'s), else what happened meanwhile, else "silent"."""
+        out = []
+        for begin, end in sorted(stream.silences):
+            reason = next((r for b, e, r in known if b < end and e > begin), "")
+            if not reason:
+                inside = [h for h in self.happened if h.begin_ns <= end + S and h.end_ns >= begin - S]
+                reason = next((h.kind for h in inside if h.kind in _REASONS), "silent")
+            out.append(Silence(begin, end, reason))
+        return out
+
+
+_REASONS = ("LOSS", "ACCEL_LOST", "ACCEL_GAP", "CLOCK_STEP", "GNSS_TIME_STEP", "OUTAGE_END", "MODE", "START")
+"""Kinds of events that explain a silence by themselves."""
+
+
+def _count(into: dict[int, int], values: U8) -> None:
+    for value, n in zip(*np.unique(values, return_counts=True), strict=True):
+        into[int(value)] = into.get(int(value), 0) + int(n)
+
+
+def overview(inputs: Sequence[Path], *, accelerations: bool = True) -> Overview:
+    """Summary of files and folders. ReplayError where nothing among them holds a configuration."""
+    files, bad = files_of(inputs)
+    out = Overview()
+    for piece in pieces(files, configuration(files), accelerations=accelerations):
+        out.add(piece)
+    out.files.update(bad)
+    return out
