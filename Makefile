@@ -3,14 +3,20 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= auto
+FAULTS ?= all
 
-.PHONY: demo test lint judges clean
+.PHONY: demo test lint bench judges vm-test kill-test fuzz soak clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo    a simulated bridge through real ports, 60 s, with picture and files in demo-out/"
 	@echo "make test    lint, types and all tests"
+	@echo "make bench   figures against their goals; ROWS=filter,replay chooses, COMPARE=<commit> runs two checkouts in turn"
 	@echo "make judges  our files before readers that nobody here wrote (rerun, @mcap/core)"
+	@echo "make kill-test   KILLS=20 SIGKILLs under load, every file recovered and judged; flipped bits too"
+	@echo "make fuzz        MINUTES=1 of spoilt input for each parser; TARGETS=nmea,mcap chooses"
+	@echo "make soak        a simulated month of recording in at most MINUTES=120: memory, descriptors, threads stand still"
+	@echo "make vm-test     the service in a virtual machine, with a table of faults; 10 minutes, 6 with FAULTS=few"
 
 $(VENV)/.demo: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -26,6 +32,11 @@ $(VENV)/.judges: $(VENV)/.test
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[judges]'
 	touch $@
 
+# What cannot be installed here is a column that says so, not an error.
+$(VENV)/.bench: $(VENV)/.demo
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[bench]' || echo "bench: some peers are missing"
+	touch $@
+
 demo: $(VENV)/.demo
 	$(BIN)/edge-agent demo -o demo-out
 
@@ -37,8 +48,26 @@ lint: $(VENV)/.test
 test: lint
 	$(BIN)/pytest -n $(JOBS) -q
 
+bench: $(VENV)/.bench
+	$(BIN)/python tests/bench/run.py $(if $(ROWS),--rows $(ROWS)) $(if $(COMPARE),--compare $(COMPARE)) $(BENCH)
+
 judges: $(VENV)/.judges
 	$(BIN)/python tests/judges/run.py
+
+KILLS ?= 20
+comma := ,
+kill-test: $(VENV)/.test
+	nice -n 10 $(BIN)/python tests/faults/flips.py 10000
+	nice -n 10 $(BIN)/python tests/faults/kills.py $(KILLS)
+
+fuzz: $(VENV)/.test
+	nice -n 10 $(BIN)/python tests/fuzz/fuzz.py $(or $(MINUTES),1) $(subst $(comma), ,$(TARGETS))
+
+soak: $(VENV)/.test
+	nice -n 10 $(BIN)/python tests/faults/soak.py $(or $(MINUTES),120)
+
+vm-test: $(VENV)/.test
+	nice -n 10 $(BIN)/python tests/vm/run.py --faults $(FAULTS)
 
 clean:
 	rm -rf $(VENV) demo-out build *.egg-info

@@ -2,7 +2,8 @@
 
 The image holds nothing of the project: systemd, udev, can-utils and Python, so a test begins on an empty gateway. It is
 cached outside of the repository under a key of all that goes in (this file, `guest/`, the package list, the kernel's
-version) and takes about a minute to build, as root or as a user with subuids.
+version) and takes about a minute to build, as root or as a user with subuids. Debian's mirror, reached through apt, is
+needed for that; where something of it fails, it is a RuntimeError with the reason.
 
 The kernel is Debian's `linux-image-amd64` (the cloud one has no CAN), unpacked only: its modules are copied, its
 vmlinux is taken out of the bzImage, since unpacking that under emulation takes seconds.
@@ -122,14 +123,24 @@ def build(say: Say) -> Path:
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     try:
-        _kernel(work, kernel)
-        _root(work)
+        try:
+            _make(work, kernel)
+        except RuntimeError as e:  # a mirror has its bad moments
+            say(f"once more: {e}")
+            shutil.rmtree(work)
+            work.mkdir()
+            _make(work, kernel)
         for name in ("vmlinux", "initrd.cpio", "base.qcow2"):
             out.mkdir(exist_ok=True)
             os.replace(work / name, out / name)
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return out
+
+
+def _make(work: Path, kernel: str) -> None:
+    _kernel(work, kernel)
+    _root(work)
 
 
 def _run(command: Sequence[str | Path], cwd: Path | None = None) -> str:
@@ -156,7 +167,7 @@ def _kernel(work: Path, package: str) -> None:
     """vmlinux and initrd.cpio, and modules.tar for the root file system."""
     release = package.removeprefix("linux-image-")
     _run(["apt-get", "download", package, "busybox-static"], cwd=work)
-    (deb,), (busybox,) = work.glob("linux-image-*.deb"), work.glob("busybox-static_*.deb")
+    deb, busybox = next(work.glob("linux-image-*.deb")), next(work.glob("busybox-static_*.deb"))
     for archive, parts in ((deb, KERNEL_PARTS), (busybox, ("./bin/busybox",))):
         (work / "data.tar").write_bytes(
             subprocess.run(["dpkg-deb", "--fsys-tarfile", archive], check=True, capture_output=True).stdout
@@ -189,6 +200,8 @@ class Modules:
         self.root = root
         self.base = root / "lib/modules" / release
         self._files = {p.stem.replace("-", "_"): p for p in self.base.glob("kernel/**/*.ko")}
+        if not self._files:
+            raise RuntimeError("the modules of this kernel are compressed; that of Debian 12 is needed")
 
     def path(self, name: str) -> Path:
         return self._files[name]

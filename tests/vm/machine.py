@@ -7,6 +7,8 @@
 Needs neither root nor KVM. `fresh` restores a snapshot of the booted system, which is made on the first use and cached
 beside the image. The guest sees `share` as /mnt/share, read-only, and `out` as /mnt/out. QEMU does not pace serial
 input by the baud rate: the host must. can0 and can1 are two SJA1000 cards on one bus.
+
+Every wait here is patient: under emulation, on a host with other work, a second may become a minute.
 """
 
 from __future__ import annotations
@@ -18,13 +20,17 @@ import os
 import shutil
 import socket
 import subprocess
+import sys
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 BOOT_S = 240.0  # 10 s on a quiet machine; more with other work beside it
+COMMAND_S = 180.0  # of a command in the guest; most take 0.1 s
+QEMU_S = 120.0  # until QEMU opens its sockets
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,16 +46,19 @@ class GuestError(RuntimeError):
     """A command in the guest failed; the text has its output."""
 
 
-def accelerator() -> list[str]:
+EMULATION = ("-accel", "tcg,thread=multi,tb-size=256", "-cpu", "max")
+
+
+def accelerator() -> tuple[str, ...]:
     """KVM where the processor has it, else emulation. /dev/kvm alone proves nothing: a software KVM has no vmx or svm,
     and a stock kernel does not start on it."""
     hardware = any(f" {flag}" in Path("/proc/cpuinfo").read_text() for flag in ("vmx", "svm"))
     if hardware and os.access("/dev/kvm", os.R_OK | os.W_OK):
-        return ["-accel", "kvm", "-cpu", "host"]
-    return ["-accel", "tcg,thread=multi,tb-size=256", "-cpu", "max"]
+        return ("-accel", "kvm", "-cpu", "host")
+    return EMULATION
 
 
-def _command(image: Path, disk: Path, folder: Path, share: Path, out: Path) -> list[str]:
+def _command(image: Path, disk: Path, folder: Path, share: Path, out: Path, accel: Sequence[str]) -> list[str]:
     """QEMU's command line; its devices belong to the snapshot."""
 
     def channel(name: str) -> list[str]:
@@ -59,7 +68,7 @@ def _command(image: Path, disk: Path, folder: Path, share: Path, out: Path) -> l
         return ["-virtfs", f"local,path={path},mount_tag={tag},security_model=none,multidevs=remap{more}"]
 
     return [
-        *("qemu-system-x86_64", "-M", "q35", *accelerator(), "-smp", "2", "-m", "1024"),
+        *("qemu-system-x86_64", "-M", "q35", *accel, "-smp", "2", "-m", "1024"),
         *("-nodefaults", "-no-user-config", "-display", "none", "-no-reboot", "-nic", "none"),
         *("-kernel", f"{image}/vmlinux", "-initrd", f"{image}/initrd.cpio"),
         *("-append", "console=ttyS0 root=/dev/vda panic=-1 quiet"),
@@ -87,15 +96,19 @@ def _command(image: Path, disk: Path, folder: Path, share: Path, out: Path) -> l
 class Machine:
     """One running machine; close it, or use it as a context."""
 
+    accel = accelerator()  # emulation once the processor's help has failed
+
     def __init__(self, image: Path, disk: Path, share: Path, out: Path, snapshot: str = "") -> None:
         self.disk = disk
         self.folder = Path(tempfile.mkdtemp(prefix="edge-agent-vm-"))
         self._numbers = itertools.count(1)
         self._qmp: tuple[socket.socket, Any] | None = None
-        self._began = time.monotonic()
         with (self.folder / "qemu.log").open("wb") as log:
             self._process = subprocess.Popen(
-                [*_command(image, disk, self.folder, share, out), *(["-loadvm", snapshot] if snapshot else [])],
+                [
+                    *_command(image, disk, self.folder, share, out, self.accel),
+                    *(["-loadvm", snapshot] if snapshot else []),
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -110,41 +123,58 @@ class Machine:
     # ---------------------------------------------------------------------------------------------------- how it starts
 
     @classmethod
-    def boot(cls, image: Path, disk: Path, share: Path, out: Path) -> Self:
+    def boot(cls, image: Path, disk: Path, share: Path, out: Path) -> Machine:
         """A real boot of a disk."""
-        machine = cls(image, disk, share, out)
-        try:
-            machine._agent.settimeout(BOOT_S)
-            machine._answers.readline()
-        except BaseException:
-            machine.close()
-            raise
-        return machine
+
+        def start() -> Machine:
+            machine = cls(image, disk, share, out)
+            try:
+                machine._answer(BOOT_S)
+            except BaseException:
+                machine.close()
+                raise
+            return machine
+
+        return cls._twice(start)
 
     @classmethod
-    def fresh(cls, image: Path, share: Path, out: Path) -> Self:
+    def fresh(cls, image: Path, share: Path, out: Path) -> Machine:
         """A machine just booted, on a disk of its own that goes away with it."""
-        nowhere = Path("/nonexistent")
-        key = hashlib.sha256(" ".join(_command(image, nowhere, nowhere, nowhere, nowhere)).encode()).hexdigest()[:16]
-        ready = image / f"ready-{key}.qcow2"
-        if not ready.exists():
-            cls._make_ready(image, ready, share, out)
-        folder = Path(tempfile.mkdtemp(prefix="edge-agent-disk-"))
-        disk = folder / "disk.qcow2"
+
+        def start() -> Machine:
+            nowhere = Path("/nonexistent")
+            line = " ".join(_command(image, nowhere, nowhere, nowhere, nowhere, cls.accel))
+            ready = image / f"ready-{hashlib.sha256(line.encode()).hexdigest()[:16]}.qcow2"
+            if not ready.exists():
+                cls._make_ready(image, ready, share, out)
+            folder = Path(tempfile.mkdtemp(prefix="edge-agent-disk-"))
+            disk = folder / "disk.qcow2"
+            try:
+                subprocess.run(["cp", "--sparse=always", "--reflink=auto", ready, disk], check=True)
+                machine = cls(image, disk, share, out, "ready")
+            except BaseException:
+                shutil.rmtree(folder)
+                raise
+            machine._own = folder
+            try:
+                machine.set_clock()
+                machine.mount()
+            except BaseException:
+                machine.close()
+                raise
+            return machine
+
+        return cls._twice(start)
+
+    @classmethod
+    def _twice(cls, start: Callable[[], Machine]) -> Machine:
+        """A machine that does not come up gets a second chance, without the processor's help."""
         try:
-            subprocess.run(["cp", "--sparse=always", "--reflink=auto", ready, disk], check=True)
-            machine = cls(image, disk, share, out, "ready")
-        except BaseException:
-            shutil.rmtree(folder)
-            raise
-        machine._own = folder
-        try:
-            machine.set_clock()
-            machine.mount()
-        except BaseException:
-            machine.close()
-            raise
-        return machine
+            return start()
+        except (OSError, RuntimeError, ValueError, subprocess.CalledProcessError) as e:
+            print(f"the machine did not come up, once more: {e}", file=sys.stderr, flush=True)
+            cls.accel = EMULATION
+            return start()
 
     @classmethod
     def _make_ready(cls, image: Path, ready: Path, share: Path, out: Path) -> None:
@@ -153,7 +183,9 @@ class Machine:
         base = str(image / "base.qcow2")
         subprocess.run(["qemu-img", "create", "-q", "-f", "qcow2", "-b", base, "-F", "qcow2", new], check=True)
         with cls.boot(image, new, share, out) as machine:
-            machine.sh("systemctl is-system-running --wait || true; modprobe -a 9p 9pnet_virtio; sync", timeout=BOOT_S)
+            machine.sh(
+                "systemctl is-system-running --wait || true; modprobe -a 9p 9pnet_virtio; sync", timeout=2 * BOOT_S
+            )
             answer = machine.monitor("savevm ready")
             if answer:
                 raise RuntimeError(f"QEMU made no snapshot: {answer}")
@@ -162,17 +194,28 @@ class Machine:
 
     # --------------------------------------------------------------------------------------------------- what it can do
 
-    def run(self, command: str, timeout: float = 60.0) -> Done:
+    def run(self, command: str, timeout: float = COMMAND_S) -> Done:
         """Run a shell command in the guest."""
         number = next(self._numbers)
-        self._agent.settimeout(timeout + 30)
         self._agent.sendall(json.dumps({"id": number, "cmd": command, "timeout": timeout}).encode() + b"\n")
         while True:
-            answer = json.loads(self._answers.readline())
+            answer = self._answer(timeout + 60)
             if answer.get("id") == number:
                 return Done(answer["rc"], answer["out"], answer["err"])
 
-    def sh(self, command: str, timeout: float = 60.0) -> str:
+    def _answer(self, timeout: float) -> dict[str, Any]:
+        """The next line that the guest says."""
+        self._agent.settimeout(timeout)
+        try:
+            line = self._answers.readline()
+        except ConnectionError:
+            line = b""
+        if not line:
+            raise RuntimeError(f"QEMU ended: {(self.folder / 'qemu.log').read_text()}")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def sh(self, command: str, timeout: float = COMMAND_S) -> str:
         """Run a shell command in the guest; its output. Raises GuestError where it fails."""
         done = self.run(command, timeout)
         if done.rc:
@@ -190,7 +233,8 @@ class Machine:
 
     def port(self, name: str) -> socket.socket:
         """The host's end of ttyS1, ttyS2, usb0."""
-        for _ in range(400):
+        end_s = time.monotonic() + QEMU_S
+        while time.monotonic() < end_s:
             if self._process.poll() is not None:
                 raise RuntimeError(f"QEMU ended: {(self.folder / 'qemu.log').read_text()}")
             end = socket.socket(socket.AF_UNIX)
