@@ -341,6 +341,7 @@ def _status(args: argparse.Namespace) -> int:
         )
         return GOOD
     while True:
+        now = time.time_ns()  # before the file is read: a slow machine must not make it look old
         try:
             path, found = status.load(places, data_dir)
         except FileNotFoundError as e:
@@ -349,7 +350,6 @@ def _status(args: argparse.Namespace) -> int:
         except status.StatusError as e:
             _say(f"edge-agent: status: {e}")
             return WANTING
-        now = time.time_ns()
         if args.json:
             print(json.dumps(watch.report(path, found, now), ensure_ascii=False), flush=True)
         else:

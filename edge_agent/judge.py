@@ -31,6 +31,7 @@ from edge_agent.messages import (
     Quality,
     Raw,
     ReceiverSettings,
+    Reject,
     S,
     Tick,
 )
@@ -42,6 +43,7 @@ LATENCY_SLACK_MS = 20.0  # a latency that is wrong by so much is 1 mm at 50 mm/s
 RATE_SLACK = 0.05  # of a configured rate: worse than any oscillator
 TILT_NOTE_DEG, TILT_BAD_DEG = 5.0, 20.0  # of gravity from the z axis: a bracket that is not level, a wrong rotation
 MOVING_MPS2 = 1.0  # sd of an acceleration: not at rest
+INCOMPLETE_LEAST = 2  # samples with a missing axis at the begin: it was amid one, and their order was not known yet
 LISTED = 12  # identifiers named in one line
 
 _SENTENCE = re.compile(rb"\$([A-Z][A-Z0-9]{2,9})(?:,[ -#%-)+-~]*)?\*([0-9A-Fa-f]{2})")
@@ -320,11 +322,15 @@ def _judge_accelerometer(
     reasons: Counter[str] = Counter()
     for block in blocks:
         got, remarks = codec.feed(block)
-        reasons.update(r.reason for r in remarks if hasattr(r, "reason"))
+        for r in remarks:
+            if isinstance(r, Reject):
+                reasons[r.reason] += r.count
         if got is not None:
             samples.append(got)
+    if samples and codec.counters["incomplete"] <= INCOMPLETE_LEAST:
+        del reasons["INCOMPLETE"]
     if reasons:
-        text = f"frames refused: {', '.join(f'{k} {n} times' for k, n in reasons.most_common())}"
+        text = f"frames refused: {', '.join(f'{n} {k}' for k, n in reasons.most_common())}"
         yield Finding(BAD, where, f"{text}; check the DBC file against the sensor")
     if not samples:
         if not reasons:

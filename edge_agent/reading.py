@@ -108,6 +108,8 @@ class Reader(threading.Thread):
             except drivers.PortError as e:
                 self.port.close()
                 self.busy_ns = 0
+                if self.abandoned:
+                    return  # the port is another reader's, and so is its state
                 self.state = "LOST"
                 self._fault("PORT_LOST", f"{e}; next try in {wait:.0f} s", (("retry_s", wait),))
                 self.stopping.wait(wait)
@@ -155,7 +157,7 @@ class PortWatch:
     def look(self, t_ns: int, counts: Mapping[str, int]) -> tuple[str, str] | None:
         """counts: bytes (or frames), good (sentences or samples), positions, bus_off, all cumulative. Return (state,
         text)."""
-        bus_off = counts.get("bus_off", 0) != self._seen.get("bus_off", 0)
+        bus_off = counts.get("bus_off", 0) > self._seen.get("bus_off", 0)  # a fresh port counts from 0
         for key, value in counts.items():
             if self._seen.get(key) != value or key not in self._since:
                 self._since[key] = t_ns

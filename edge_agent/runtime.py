@@ -62,6 +62,7 @@ from edge_agent.writing import DERIVED_SHARE, MB, Beat, Keep, Writer, free_bytes
 
 STALLED_S = 5.0  # the writer is at one operation so long
 STATE_FILE = "state/kept.bin"
+READERS_S = 5.0  # at a stop, what all readers together may take to come back from their drivers
 CLIPS_S = 10.0  # at a stop, what clips may still take
 RESERVE_BYTES = MB  # of the outbox beyond its bound, for Ticks and for what tells of the loss
 HEAD_RECORDS = 64  # Ticks, faults and diagnostics that wait for the first data; then the first file begins without
@@ -179,9 +180,10 @@ class Agent:
             if self.stop.is_set():
                 break
         self.notifier.send("STOPPING=1")
+        end = time.monotonic() + READERS_S
         for reader in self.readers.values():
             if reader.ident is not None:
-                reader.join(timeout=5.0)
+                reader.join(timeout=max(0.0, end - time.monotonic()))
         for arrival in self.inbox.take(0.0):
             self._arrived(arrival)
         for record in self.pipeline.finish():

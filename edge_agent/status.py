@@ -372,6 +372,8 @@ def problems(status: Status, now_utc_ns: int) -> list[str]:
             found.append(f"point {point.name} {point.mode}: not valid")
         elif point.accelerometer and point.mode == Mode.GNSS_ONLY.name:
             found.append(f"point {point.name} goes on without {point.accelerometer}")
+        elif "JUMP_OPEN" in point.flags:
+            found.append(f"point {point.name}: its fixes stand on another level; they or the estimate are wrong")
     for a in status.accelerometers:
         if a.port not in poor and _slow(a) and status.uptime_s > START_S:
             found.append(f"{a.name} gives {a.rate_hz:.1f} Hz of {a.expected_hz:.1f} Hz")

@@ -68,8 +68,9 @@ def watch(
         with screen(out, moves):
             while True:
                 width, height = size()
+                now_ns = now()  # before the file is read: a slow machine must not make it look old
                 try:
-                    text = st.render(look()[1], width, height if moves else None, now(), colour)
+                    text = st.render(look()[1], width, height if moves else None, now_ns, colour)
                 except (FileNotFoundError, st.StatusError) as e:  # the agent may be on its way
                     text = f"{e}\nwaiting for it; Ctrl-C ends"
                 if moves:

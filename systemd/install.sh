@@ -85,6 +85,13 @@ make_user() {
         useradd --system --user-group --home-dir $DATA --no-create-home --shell /usr/sbin/nologin $NAME
         say "  user $NAME"
     fi
+    # The unit would see to both; `check --live` runs as this user before the first start.
+    usermod -aG dialout $NAME
+    if [ ! -d $DATA ]; then
+        mkdir -p $DATA
+        chmod 0755 $DATA
+        chown $NAME:$NAME $DATA
+    fi
 }
 
 make_venv() {
@@ -135,8 +142,8 @@ install() {
         check_python
         say "installing:"
         make_user
+        say "  $VENV (takes some minutes on a small board)"
         make_venv
-        say "  $VENV"
     else
         say "files below $ROOT:"
     fi
@@ -169,9 +176,9 @@ install() {
     if [ -n "$first" ]; then
         say "next:"
         say "  1. write $ETC/site.yaml (a copy of the example, which explains every key)"
-        say "  2. edge-agent check -c $ETC/site.yaml"
-        say "  3. systemctl enable --now systemd-networkd     # if can0 is to come up by $NETWORK"
-        say "  4. systemctl enable --now $NAME && systemctl status $NAME"
+        say "  2. set the sensors' bit rate in $NETWORK, then systemctl enable --now systemd-networkd"
+        say "  3. edge-agent check -c $ETC/site.yaml; sudo -u $NAME edge-agent check --live -c $ETC/site.yaml"
+        say "  4. systemctl enable --now $NAME && edge-agent status --watch"
     elif ! $VENV/bin/edge-agent check -c $ETC/site.yaml; then
         fail "$ETC/site.yaml does not fit this version: see above"
     fi

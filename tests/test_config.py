@@ -479,10 +479,16 @@ README = (Path(__file__).resolve().parents[1] / "README.md").read_text()
 
 
 def test_the_example_of_the_readme_is_good() -> None:
-    (text,) = re.findall(r"```yaml\n(.*?)```", README, re.DOTALL)
+    text, instead = re.findall(r"```yaml\n(.*?)```", README, re.DOTALL)
     site = parse(text, Path(), lambda name: {"sensor.dbc": DBC.replace('"g"', '"m/s2"').encode()}[name])
     assert site.data_dir == "/var/lib/edge-agent"
     assert set(site.points) == {"mid"}
+    kept = [line for line in text.splitlines() if not line.strip().startswith(("dbc:", "signals:"))]
+    at = next(i for i, line in enumerate(kept) if line.strip().startswith("rotation:"))
+    site = parse("\n".join([*kept[:at], instead, *kept[at:]]), Path())
+    fields = site.accelerometers["deck"].fields
+    assert fields is not None
+    assert [f.start for f in fields] == [0, 16, 32]
 
 
 def test_the_readme_lists_every_key_with_its_default() -> None:

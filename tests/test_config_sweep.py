@@ -218,6 +218,28 @@ def fuse(made: Config) -> Outputs:
     return out
 
 
+@functools.cache
+def calm() -> tuple[Any, ...]:
+    """A structure that sways, with good fixes for 30 s, then accelerations alone for 10 s."""
+    rng = np.random.default_rng(4)
+    t = 1000 * S + (np.arange(800) * S) // 20
+    at = (t - 1000 * S) / S
+    w = 2 * np.pi * 0.4
+    size = np.array([0.006, 0.004, 0.003])
+    xyz = -w * w * np.sin(w * at)[:, None] * size + rng.normal(0, 1e-3, (800, 3))
+    tf = 1000 * S + (np.arange(150) * S) // 5 + 7_000_000
+    z = np.sin(w * (tf - 1000 * S) / S)[:, None] * size + rng.normal(0, 1, (150, 3)) * np.array([0.003, 0.003, 0.006])
+    return (*accel_items(t, xyz, blocks_of(t, S // 2), t), *fix_items(tf, z, 40_000_000))
+
+
+def coast(made: Config) -> Outputs:
+    """Mode and flags of a point that loses its fixes and nothing else."""
+    played = Played(Station([config.PointSettings("both", "r", "a")], made.fusion))
+    for item in sorted(calm(), key=lambda i: int(i[0])):
+        hand(played, item)
+    return {name: played.column(name, "both").tobytes() for name in ("mode", "flags")}
+
+
 # ---------------------------------------------------------------------------------------------------------- recording
 
 T = 1_700_000_000 * S
@@ -514,9 +536,9 @@ ROWS: dict[str, Row] = {
     "fusion.wait_s": Row(fuse, "fusion.wait_s=0.1", "both.displacement_m"),
     "fusion.invalid_std_horizontal_m": Row(fuse, "fusion.invalid_std_horizontal_m=0.003", "both.mode"),
     "fusion.invalid_std_vertical_m": Row(fuse, "fusion.invalid_std_vertical_m=0.004", "both.mode"),
-    "fusion.invalid_outage_s": Row(fuse, "fusion.invalid_outage_s=4", "both.mode"),
-    "fusion.degraded_std_m": Row(fuse, "fusion.degraded_std_m=0.2", "both.flags"),
-    "fusion.coast_s": Row(fuse, "fusion.coast_s=1", "both.mode"),
+    "fusion.invalid_outage_s": Row(coast, "fusion.invalid_outage_s=4", "mode"),
+    "fusion.degraded_std_m": Row(coast, "fusion.degraded_std_m=0.2", "flags"),
+    "fusion.coast_s": Row(coast, "fusion.coast_s=1", "mode"),
     "fusion.outage_s": Row(fuse, "fusion.outage_s=60", "verdicts"),
     "fusion.lockout_s": Row(fuse, "fusion.lockout_s=6", "events"),
     "fusion.accel_noise_m2ps3": Row(fuse, "fusion.accel_noise_m2ps3=1e-6", "both.displacement_m"),
@@ -567,7 +589,7 @@ ROWS: dict[str, Row] = {
     "events.release": Row(events, "events.release=0.1", "events", MOVED),
     "events.clips_gb": Row(clip, "events.clips_gb=0.001", "files", PULLED),
     "events.hook": Row(clip, "events.hook=[/bin/false]", "told", PULLED),
-    "events.hook_s": Row(clip, "events.hook_s=0.05", "told", (*PULLED, "events.hook=[/bin/sh, -c, sleep 0.4]")),
+    "events.hook_s": Row(clip, "events.hook_s=0.05", "told", (*PULLED, "events.hook=[/bin/sh, -c, sleep 1]")),
     "record.accel_block": Row(path, "record.accel_block=false", "/accel/acc/block"),
 }
 

@@ -348,7 +348,7 @@ def test_a_good_sensor_has_nothing_to_mend() -> None:
             replace(block(REST), length=np.full(200, 4, np.uint8)),
             "accelerometers.deck",
             BAD,
-            "frames refused: SHORT",
+            "frames refused: 200 SHORT",
         ),
     ],
 )
@@ -364,6 +364,31 @@ def test_a_wrong_row_of_the_rotation_that_was_told_is_right_when_put_in() -> Non
     raws = block((-9.8, 0.1, 0.2))
     right = replace(DECK, rotation=((0, 0, 1), (0, 1, 0), (-1, 0, 0)))
     assert said(judged(right, raws), BAD) == []
+
+
+def in_three_frames(order: str, begin: int, gone: int = 0) -> CanFrames:
+    """The sensor at rest as a message per axis in this order, from the frame `begin` on, without every `gone`-th."""
+    whole = block(REST)
+    keep = [k for k in range(begin, 600) if not gone or k % gone]
+    at = np.array(keep) // 3
+    axis = np.array(["xyz".index(order[k % 3]) for k in keep])
+    data = np.zeros((at.size, 8), np.uint8)
+    for k in (0, 1):
+        data[:, k] = whole.data[at, 2 * axis + k]
+    t = whole.t_ns[at] + np.array(keep) % 3 * 300_000
+    flags = np.zeros(at.size, np.uint8)
+    return CanFrames(t, (0x188 + axis).astype(np.uint32), flags, np.full(at.size, 8, np.uint8), data)
+
+
+@pytest.mark.parametrize("order", ["xyz", "zyx"])
+@pytest.mark.parametrize("begin", [0, 1, 2])
+def test_listening_begins_amid_a_sample_of_several_frames(order: str, begin: int) -> None:
+    """That is nobody's fault; frames that are missing again and again are, and each is counted."""
+    fields = tuple(SignalField(0x188 + i, 0, 16, scale=0.001) for i in range(3))
+    sensor = replace(DECK, fields=fields)
+    assert set(levels(judged(sensor, in_three_frames(order, begin))).values()) == {GOOD}
+    bad = said(judged(sensor, in_three_frames(order, begin, gone=30)), BAD)
+    assert re.match(r"accelerometers.deck: frames refused: [34]\d INCOMPLETE; check the DBC file", bad[0])
 
 
 def test_samples_that_the_sensor_counted_and_nobody_saw_are_told() -> None:

@@ -356,6 +356,16 @@ def test_bus_off_is_said_at_once_and_is_over_with_the_next_sample() -> None:
     assert "short circuit" in told[3][1]
 
 
+def test_a_port_that_counts_from_0_again_has_not_left_the_bus() -> None:
+    """Another reader has taken over, with a port of its own."""
+    watch = PortWatch("can")
+    told = [
+        watch.look(t * S, {"bytes": t, "good": t, "positions": 0, "bus_off": off})
+        for t, off in enumerate((0, 2, 2, 0, 0, 1))
+    ]
+    assert [(t, x[0]) for t, x in enumerate(told) if x] == [(1, "BUS_OFF"), (2, "OK"), (5, "BUS_OFF")]
+
+
 def test_states_reach_the_recording(tmp_path: Path) -> None:
     with Live(settings(tmp_path), ports()) as live:
         for i in range(12):

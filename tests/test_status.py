@@ -681,6 +681,7 @@ def test_a_folder_that_hangs_holds_up_nobody(
         assert publisher is not None
         assert publisher.written == 0
         gate.set()
+    publisher.join(60)  # the agent itself waits for 2 s only
     assert st.load([tmp_path / "run"])[1].state == "stopped"
     assert live.balance() == {}
 

@@ -6,13 +6,16 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from live import Live, ScriptedPort, faults, ledgers, raws, recordings, until, values
 
+from drivers import PortError
 from edge_agent import config, reading, runtime
 from edge_agent.messages import MS, Config, Raw, Record, Rotate, S, Tick
+from edge_agent.queues import ByteQueue
 from edge_agent.reading import PortWatch, payload_size
 from edge_agent.recording.segments import Recorder
 from edge_agent.replay import replay
@@ -324,6 +327,48 @@ def test_a_reader_that_hangs_is_replaced_alone(script: list[Raw], tmp_path: Path
     files = recordings(tmp_path / "rec")
     assert kinds(files, CAN)[:2] == ["PORT_HUNG", "PORT_OPEN"]
     assert len([r for r in raws(files) if r.source == CAN]) == 10
+
+
+def test_a_reader_that_was_replaced_says_nothing_of_the_port_any_more() -> None:
+    inbox: ByteQueue[Any] = ByteQueue(1000)
+    port = ScriptedPort()
+    reader = reading.Reader(CAN, port, inbox, reading.Account(), threading.Event())
+
+    def lost() -> list[tuple[int, Any]]:
+        reader.abandoned = True
+        raise PortError("the device is gone")
+
+    port.read = lost  # type: ignore[method-assign]
+    reader.run()
+    assert len(inbox) == 0
+    assert port.counters["closes"] == 1
+    assert reader.failure is None
+
+
+def test_a_stop_waits_for_hung_readers_together_not_for_one_after_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file must be finished inside the time that systemd gives, however many drivers hang."""
+    stuck = {GNSS: Stuck(), CAN: Stuck()}
+    patience: list[float] = []
+    clock = Time()
+
+    def join(reader: reading.Reader, timeout: float | None = None) -> None:
+        if reader.source in stuck:
+            patience.append(timeout or 0.0)
+            clock.ns += int((timeout or 0.0) * S)
+
+    with Live(settings(tmp_path), {**ports(), **stuck}) as live:
+        live.play([tick(0)], step=True)
+        for port in stuck.values():
+            assert port.entered.wait(60)
+        monkeypatch.setattr(reading.Reader, "join", join)
+        real = runtime.time
+        frozen = SimpleNamespace(monotonic=lambda: clock.ns / S, monotonic_ns=real.monotonic_ns, time_ns=real.time_ns)
+        monkeypatch.setattr(runtime, "time", frozen)
+    assert patience == [runtime.READERS_S, 0.0]
+    for port in stuck.values():
+        port.free.set()
 
 
 def test_no_more_than_three_readers_of_a_port_hang(tmp_path: Path) -> None:

@@ -156,11 +156,11 @@ class Gate:
                 return Action.USE
             return Action.OFFSET
         self.calm = False
+        if self.open and fits_zero:
+            return Action.CONSUMED
         if follow and before and before[1] and self._agree(t_ns, level, R, Pv, (before[0], *before[2:]), limit):
             self.history = []
             return Action.FOLLOW
-        if self.open and fits_zero:
-            return Action.CONSUMED
         agreeing = [h for h in self.history if h[1] and self._agree(t_ns, level, R, Pv, (h[0], h[2], h[3]), limit)]
         if len(agreeing) >= AGREE:
             n = len(agreeing)

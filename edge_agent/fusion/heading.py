@@ -170,11 +170,9 @@ class HeadingFilter:
             return [self._told(x, base + step, math.nan, Verdict.OLD)]
         if x.quality != Quality.FIXED:
             return [self._told(x, base + step, math.nan, Verdict.PRECHECK)]
-        if len(w) == START_MOST:
-            del w[0]
         w.append((x.t_ns, x.heading_deg, base, step))
         n = len(w)
-        if n < START_LEAST or (x.t_ns - w[0][0]) / S < self.settings.start_s:
+        if n < START_LEAST or (n < START_MOST and (x.t_ns - w[0][0]) / S < self.settings.start_s):
             return [self._told(x, base + step, math.nan, Verdict.START)]
         from_first = [wrap(v[1] - w[0][1]) for v in w]
         level = sorted(from_first)[n // 2]

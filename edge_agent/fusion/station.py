@@ -12,9 +12,9 @@ dropped.
 
 Kinds of points. *Both sensors*: as above. *No accelerometer* (or one that is silent for `accel_lost_s`): the same
 filter with zero integrals, where -b is the acceleration and its walk the model; one estimate per fix, mode GNSS_ONLY.
-Of one that fell silent the last 10 s say how much motion to expect at least, as across a gap. *No receiver*: there is no absolute displacement; displacement is held about zero by one pseudo-measurement a second
-with sd `accel_only_std_m`, so vibration above some 0.05 Hz is right and the quasi-static part is not there; mode
-ACCEL_ONLY.
+Of one that fell silent the last 10 s say how much motion to expect at least, as across a gap. *No receiver*: there is
+no absolute displacement; displacement is held about zero by one pseudo-measurement a second with sd
+`accel_only_std_m`, so vibration above some 0.05 Hz is right and the quasi-static part is not there; mode ACCEL_ONLY.
 
 A sample's estimate uses every fix that was handed over before it and is not later than it, so it does not depend on how
 the accelerations were cut into blocks. Samples with a NaN axis are left out (a missing sample). Nothing is emitted
@@ -84,7 +84,7 @@ FOLLOW = 4.0
 BEND_S = 60.0
 """Over which the usual bending is averaged."""
 START_FIXES = 2000
-"""Fixes of a start window at most: 15 s at more than 100 Hz."""
+"""Fixes of a start window at most, 15 s at more than 100 Hz: a full one is enough, however long `start_s`."""
 PENDING = 256
 """Fixes that wait for accelerations at most; the oldest is applied without them."""
 FUSED, ACCEL_ONLY = int(Mode.FUSED), int(Mode.ACCEL_ONLY)
@@ -344,11 +344,9 @@ class Station:
         if aided:
             self._rebase(p, fix.t_ns)
         pt.window.append((fix.t_ns, s1, s2, np.array(fix.z_m), np.array(fix.std_m)))
-        if len(pt.window) > START_FIXES:
-            del pt.window[0]
         out.append(self._verdict(p, fix, Verdict.START))
-        first_ns = pt.window[0][0]
-        if fix.t_ns - first_ns >= int(s.start_s * S) - S // 20 and len(pt.window) >= 8:
+        n = len(pt.window)
+        if n == START_FIXES or (fix.t_ns - pt.window[0][0] >= int(s.start_s * S) - S // 20 and n >= 8):
             self._start(p, out)
 
     def _start(self, p: int, out: Out) -> None:

@@ -30,7 +30,7 @@ from pathlib import Path
 
 from edge_agent.messages import EventSettings, Fault, Record, S, TriggerSettings
 from edge_agent.recording import topics
-from edge_agent.recording.reader import DamagedError, newest_ns, read_between, read_messages
+from edge_agent.recording.reader import DamagedError, Stored, newest_ns, read_between, read_messages
 from edge_agent.recording.segments import Recorder
 from edge_agent.recording.writer import PART, TIME_MAX, SegmentWriter
 from edge_agent.triggers import BEGIN, END
@@ -80,6 +80,8 @@ class Watch:
 
     def _extend(self, name: str, t_ns: int) -> None:
         begin, end = max(t_ns - self._before, self._kept), t_ns + self._after
+        if end <= self._kept:
+            return  # told late: the last clip holds all of it
         if not self._names:
             self._begin, self._end = begin, end
         self._begin, self._end = min(self._begin, begin), max(self._end, end)
@@ -169,14 +171,15 @@ class Clips(threading.Thread):
     def _one(self, job: Job) -> None:
         self._wait_for(job)
         try:
-            path = self._write(job)
+            made = self._write(job)
+            if made is None:
+                return
+            path, seconds = made
+            size = path.stat().st_size
         except (OSError, DamagedError) as e:
             self._tell("CLIP_FAILED", f"{', '.join(job.names)}: {e}; the segments hold the data")
             return
-        if path is None:
-            return
-        seconds = (job.end_ns - job.begin_ns) / S
-        values = (("seconds", seconds), ("bytes", float(path.stat().st_size)))
+        values = (("seconds", seconds), ("bytes", float(size)))
         self._tell("CLIP", f"{path.name}: {seconds:.1f} s, {', '.join(job.names)}", values)
         if self.settings.hook and not self.stopping.is_set() and (said := self._hook(path, job)):
             self._tell("HOOK_FAILED", f"{self.settings.hook[0]}: {said}")
@@ -191,11 +194,14 @@ class Clips(threading.Thread):
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end and not self.stopping.is_set():
             newest = next(_sources(self.recorder.recent, job.end_ns, TIME_MAX), None)
-            if newest is not None and newest_ns(newest[0]) - newest[1] >= job.end_ns:
-                return
+            with suppress(OSError, DamagedError):  # it has just been renamed: the next look finds it
+                if newest is not None and newest_ns(newest[0]) - newest[1] >= job.end_ns:
+                    return
             self.stopping.wait(self.recorder.settings.flush_s)
 
-    def _write(self, job: Job) -> Path | None:
+    def _write(self, job: Job) -> tuple[Path, float] | None:
+        """The clip and how many seconds are in it: fewer than asked for where the agent began later, or the disk has
+        not got all of it."""
         sources = [*_sources(self.recorder.recent, job.begin_ns, job.end_ns)][::-1]
         if not sources:
             self._tell("CLIP_FAILED", f"{', '.join(job.names)}: no segment holds it")
@@ -215,11 +221,13 @@ class Clips(threading.Thread):
         }
         part = self._free_name(utc_ns)
         writer = SegmentWriter(part, metadata=metadata, attachments=self.recorder.attachments, utc_ns=utc_ns)
+        first, last = job.end_ns, job.begin_ns
         try:
             for path, offset in sources:
-                for s in read_between(path, job.begin_ns + offset, job.end_ns + offset):
+                for s in _between(path, job.begin_ns + offset, job.end_ns + offset):
                     writer.add(Record(s.topic, s.log_ns, s.publish_ns, s.data, False, s.schema))
-            return writer.close()
+                    first, last = min(first, s.log_ns - offset), max(last, s.log_ns - offset)
+            return writer.close(), max(0, last - first) / S
         except (OSError, DamagedError):
             writer.abandon()
             with suppress(OSError):
@@ -243,8 +251,8 @@ class Clips(threading.Thread):
         environment.pop("NOTIFY_SOCKET", None)  # the hook does not speak for the service
         try:
             process = subprocess.Popen(argv, stdin=subprocess.DEVNULL, env=environment, start_new_session=True)
-        except OSError as e:
-            return str(e.strerror or e)
+        except (OSError, ValueError) as e:  # a NUL in an argument
+            return str(getattr(e, "strerror", None) or e)
         end = time.monotonic() + self.settings.hook_s
         while process.poll() is None and time.monotonic() < end and not self.stopping.is_set():
             self.stopping.wait(0.05)
@@ -254,6 +262,16 @@ class Clips(threading.Thread):
             process.wait()
             return f"killed: it took longer than {self.settings.hook_s:g} s" if not self.stopping.is_set() else ""
         return f"exit code {process.returncode}" if process.returncode else ""
+
+
+def _between(path: Path, begin_ns: int, end_ns: int) -> Iterator[Stored]:
+    """`read_between` of a file that may have got its final name meanwhile."""
+    try:
+        yield from read_between(path, begin_ns, end_ns)
+    except FileNotFoundError:  # before the first message: what is open stays readable
+        if not path.name.endswith(PART):
+            raise
+        yield from read_between(path.with_name(path.name.removesuffix(PART)), begin_ns, end_ns)
 
 
 def _sources(recent: Sequence[Path], begin_ns: int, end_ns: int) -> Iterator[tuple[Path, int]]:

@@ -106,10 +106,11 @@ class Plot:
             _, hi = self._xy(x[good], high[good])
             d: list[str] = []
             at = 0, 0
+            kind = "dot" if len(px) < 1200 else "dot dense"
             for a, b, c in zip(px, lo, hi, strict=True):
                 d.append(f"m{a - at[0]} {b - at[1]}v{c - b}" if d else f"M{a} {b}v{c - b}")
                 at = a, c
-            self.layers.append(f'<path d="{"".join(d)}" fill="none" stroke="{colour}" class="v dot"/>')
+            self.layers.append(f'<path d="{"".join(d)}" fill="none" stroke="{colour}" class="v {kind}"/>')
         self._legend(colour, "dot", text)
 
     def line(self, x: npt.NDArray[Any], y: F64, colour: str, text: str, far: float = math.inf) -> None:

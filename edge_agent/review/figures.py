@@ -20,7 +20,8 @@ from edge_agent.review.panels import AXES, MM, SENSOR_EVENTS, absent, mm, number
 from edge_agent.review.spectra import Spectrum
 
 OFTEN = 0.25
-"""Windows against the accelerometer above this share are a contradiction."""
+LEAST = 3
+"""Windows against the accelerometer above this share, and no fewer, are a contradiction."""
 LISTED = 2000
 """Events and gaps in the JSON twin at most."""
 
@@ -97,6 +98,10 @@ def _point(r: Review, name: str, p: PointFigures) -> dict[str, Any]:
         "frequencies": [
             {k: _value(v) if isinstance(v, float) else v for k, v in f._asdict().items()} for f in p.frequencies
         ],
+        "track": {
+            "utc": [iso(t) for t in p.track[0].tolist()],
+            "freq_hz": [[_value(v, 6) for v in row] for row in p.track[1].tolist()],
+        },
         "spectra": {
             "accelerations_m2ps4pHz": _spectrum(p.accel_spectrum),
             "fused_m2pHz": _spectrum(p.fused_spectrum),
@@ -224,10 +229,12 @@ def conclusions(r: Review) -> list[str]:
             out.append(f"{name}: no valid displacement in this period.")
             continue
         words = [f"{name}: a valid displacement for {percent(availability_of(r, p))} of the time"]
-        start = sum(b - a for a, b, m in p.spells if m == 0)
-        begin = p.valid.begin_ns - r.begin_ns
-        if begin > 5 * S or start > 5 * S:
-            words.append(f"it begins {length(begin / S)} into the record, when the filter has started")
+        begin = p.valid.begin_ns
+        if begin - r.begin_ns > 5 * S:
+            words.append(f"it begins {length((begin - r.begin_ns) / S)} into the record")
+            started = (h for h in r.overview.happened if h.kind == "START" and h.source == name)
+            if any(abs(h.end_ns - begin) < 2 * S for h in started):
+                words[-1] += ", when the filter has started"
         out.append("; ".join(words) + ".")
         told = []
         for i, axis in enumerate(AXES):
@@ -266,7 +273,7 @@ def in_doubt(a: Agreement) -> bool:
         return False
     clock = a.offset.observable and abs(a.offset.value_s) > max(3 * a.offset.std_s, CLOCK_S)
     axes = any(found not in ("?", want) for found, want in zip(a.mounting.axes, ("+x", "+y", "+z"), strict=True))
-    return clock or axes or len(a.contradictions) > OFTEN * len(a.t_ns) or not len(a.t_ns)
+    return clock or axes or not len(a.t_ns) or len(a.contradictions) > max(LEAST - 1, OFTEN * len(a.t_ns))
 
 
 def findings(r: Review) -> list[Finding]:

@@ -67,6 +67,9 @@ PEAK_DB = 9.0
 """A frequency is told as dominating where accelerations stand so far above their floor."""
 MODES = 8
 """Frequencies told of one accelerometer at most, the highest above the floor."""
+TRACK_HZ, TRACK_PARTS, TRACK_REACH = 20.0, 200, 0.06
+"""Frequencies below this are tracked in time, in at most twice so many parts of the record, within so large a share of
+their mean."""
 SAME = 0.03
 """Peaks of two sensors are one frequency within this share,"""
 SAME_LINES = 1.5
@@ -132,6 +135,7 @@ class Averaged:
         self._total: F64 = np.zeros(0)
         self._freq: F64 = np.zeros(0)
         self._segments = 0
+        self._parts: list[tuple[int, F64]] = []  # middle, density below TRACK_HZ over all columns
         self._rows: list[tuple[I64, F64]] = []
         self._run = ""
 
@@ -169,6 +173,29 @@ class Averaged:
         self._freq = found.freq_hz
         self._total = found.psd * found.segments + (self._total if self._segments else 0.0)
         self._segments += found.segments
+        low = found.psd[found.freq_hz <= TRACK_HZ].sum(axis=1)
+        self._parts.append((int(t[0]) + int(t[-1] - t[0]) // 2, low))
+        if len(self._parts) > 2 * TRACK_PARTS:
+            pairs = zip(self._parts[::2], self._parts[1::2], strict=False)
+            self._parts = [((a + b) // 2, 0.5 * (x + y)) for (a, x), (b, y) in pairs]
+
+    def track(self, freq_hz: Sequence[float]) -> tuple[I64, F64]:
+        """Where the peak near each frequency stood in each part of the record: middles (k,), Hz (k, f), NaN = none."""
+        out = np.full((len(self._parts), len(freq_hz)), np.nan)
+        step = float(self._freq[1]) if len(self._freq) > 1 else 1.0
+        for i, (_, psd) in enumerate(self._parts):
+            for j, f in enumerate(freq_hz):
+                half = max(4, round(TRACK_REACH * f / step))
+                lo, hi = round(f / step) - half, round(f / step) + half + 1
+                if lo < 1 or hi > len(psd):
+                    continue
+                db = np.log(np.maximum(psd[lo:hi], 1e-300))
+                k = int(np.argmax(db))
+                if 0 < k < len(db) - 1 and db[k] - float(np.median(db)) > 1.0:
+                    a, b, c = db[k - 1 : k + 2].tolist()
+                    bend = a - 2 * b + c
+                    out[i, j] = (lo + k + (0.5 * (a - c) / bend if bend < 0 else 0.0)) * step
+        return np.array([m for m, _ in self._parts], dtype=np.int64), out
 
     def spectrum(self) -> spectra.Spectrum | None:
         """The average with its 95 % limits; None where there was no whole segment."""
@@ -302,6 +329,7 @@ class PointFigures:
         default_factory=lambda: (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
     )
     looks: dict[tuple[int, bool], Close] = field(default_factory=dict)  # axis, whether the largest
+    track: tuple[I64, F64] = field(default_factory=lambda: (np.zeros(0, np.int64), np.zeros((0, 0))))
     close: list[Close] = field(default_factory=list)
     busy: Busy | None = None
     agreement: Agreement | None = None
@@ -475,6 +503,7 @@ def _walk(review: Review, files: Sequence[Path], segment_s: float, smooth: bool,
         if p.accelerometer in accel:
             p.accel_spectrum = accel[p.accelerometer].spectrum()
             p.frequencies = _frequencies(p, accel[p.accelerometer].busiest)
+            p.track = accel[p.accelerometer].track([f.freq_hz for f in p.frequencies])
 
 
 def _for_overview(review: Review, piece: Piece) -> Piece:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_agent.messages import F64, AccelFlag, Mode, Quality, S, Verdict
+from edge_agent.messages import F64, VALID_MODES, AccelFlag, Mode, Quality, S, Verdict
 from edge_agent.review import spectra
 from edge_agent.review.agree import CLOCK_S, Agreement
 from edge_agent.review.charts import (
@@ -39,6 +39,8 @@ MM = 1e3
 AXES = "xyz"
 LISTED = 60
 """Rows of a list at most; the JSON twin has more."""
+TRACKED = 4
+"""Parts of the record at least, for a frequency to be drawn in time."""
 BAD_EVENTS = (
     "JUMP_OPEN", "JUMP_LEVEL", "DATUM", "REACQUIRE", "OUTAGE_END", "ACCEL_LOST", "ACCEL_GAP", "CONTRADICTION",
     "CLOCK_STEP", "GNSS_TIME_STEP", "DATE_CHANGED", "WEEK_ROLLOVER", "SEPARATION",
@@ -134,7 +136,11 @@ def availability(r: Review) -> str:
 def absent(r: Review, p: PointFigures) -> list[tuple[int, int, str]]:
     """When a point had no valid estimate, and why; what is not told here adds up to less than the steps of its
     stream."""
-    out = [(a, b, why.lower().replace("_", " ")) for a, b, why in gaps_of(r, p.valid)]
+    out = []
+    for a, b, why in gaps_of(r, p.valid):
+        if why == "MODE":  # which one
+            why = next((Mode(m).name for c, d, m in p.spells if c < b and d > a and m not in VALID_MODES), why)
+        out.append((a, b, why.lower().replace("_", " ")))
     if not p.moments.n:
         return [(r.begin_ns, r.end_ns, "never started")]
     if p.valid.begin_ns - r.begin_ns > S:
@@ -241,10 +247,9 @@ def displacement(r: Review) -> str:
             if position is not None and position.stream.samples:
                 tz, z0, z1, _ = position.position.spans()
                 z0, z1 = MM * z0[:, axis], MM * z1[:, axis]
-                fine = z0[np.isfinite(z0)]
-                if len(fine) > 8:  # what most fixes span, not the wrong ones
-                    shown.append(np.quantile(fine, (0.02, 0.98)))
-                    shown.append(np.quantile(z1[np.isfinite(z1)], (0.02, 0.98)))
+                fine = np.isfinite(z0) & np.isfinite(z1) & (tz >= t[0]) & (tz <= t[-1])
+                if fine.sum() > 8:  # what most fixes span beside the estimate, not the wrong ones
+                    shown += [np.quantile(z0[fine], (0.02, 0.98)), np.quantile(z1[fine], (0.02, 0.98))]
             y0, y1 = limits(*shown)
             plot = Plot(_frame(r), Scale(y0, y1, "mm"), 200)
             if position is not None and position.stream.samples:
@@ -506,6 +511,13 @@ def frequencies(r: Review) -> str:
         for axis in range(3):
             if parts:
                 out.append(_density(f"{name} {AXES[axis]}: displacement", "mm\u00b2/Hz", parts, p, axis))
+        times, tracked = p.track
+        for i, f in enumerate(p.frequencies):
+            if len(times) >= TRACKED and np.isfinite(tracked[:, i]).sum() >= TRACKED:
+                y = tracked[:, i]
+                plot = Plot(_frame(r), Scale(*limits(y, room=0.3), "Hz"), 90)
+                plot.bars(times, y, y, BLUE, "peak of the accelerations in each part of the record")
+                out.append(plot.html(f"{name}: {number(f.freq_hz, 3)} Hz in time"))
         used = [s for s in (p.accel_spectrum, p.fused_spectrum, p.gnss_spectrum) if s is not None]
         if used:
             text = ", ".join(f"{s.segments} segments of {length(1 / float(s.freq_hz[1]))}" for s in used[:1])

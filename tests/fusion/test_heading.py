@@ -284,6 +284,14 @@ def test_a_turn_of_four_sd_is_not_smeared_over_an_hour(seed: int) -> None:
     assert told[-1].heading_deg == pytest.approx(10.8, abs=0.1)
 
 
+def test_a_full_start_window_starts_whatever_its_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 20 Hz it holds 205 s; with a longer `start_s` the heading would never start."""
+    monkeypatch.setattr(heading, "START_MOST", 50)
+    told, events = play(made(replace(FusionSettings(), start_s=60.0)), noisy(3, 20.0, lambda t: 10.0))
+    assert [e.kind for e in events] == ["HEADING_START"]
+    assert [y.verdict for y in told].count(Verdict.START) == 50
+
+
 def test_the_time_until_a_turn_is_believed_is_the_setting() -> None:
     fusion = replace(FusionSettings(), reacquire_s=5.0)
     _, events = play(made(fusion), noisy(15, 100.0, lambda t: 10.0 if t < 50 else 20.0))
@@ -465,7 +473,11 @@ def test_a_stop_at_any_heading_goes_on_as_if_there_were_none() -> None:
 
 
 def test_the_start_window_is_bounded() -> None:
+    """Also where the headings agree on nothing, so that none begins."""
     one = made(replace(FusionSettings(), start_s=1e6))
+    most = 0
     for i in range(heading.START_MOST + 500):
-        one.update(said(1.0 + i / 10, 10.0), True)
-    assert len(one.window) == heading.START_MOST
+        one.update(said(1.0 + i / 10, 37.0 * (i * i % 10)), True)
+        most = max(most, len(one.window))
+    assert not one.started
+    assert heading.START_MOST // 2 <= most <= heading.START_MOST

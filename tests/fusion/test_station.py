@@ -23,6 +23,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracles import dense_smoother
 
+from edge_agent.fusion import station
 from edge_agent.fusion.station import Station
 from edge_agent.messages import FusionFlag, FusionSettings, Measurement, Mode, PointSettings, Quality, Verdict
 from edge_agent.state import pack, unpack
@@ -42,6 +43,14 @@ def test_start_waits_for_its_window_and_says_so() -> None:
     assert all(i.verdict == Verdict.START for i in early)
     assert set(p.column("mode")) == {Mode.FUSED}
     assert all(i.verdict == Verdict.ACCEPTED for i in p.innovations if i.t_ns > p.events[0].t_ns)
+
+
+def test_a_full_start_window_is_enough_however_long_it_should_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(station, "START_FIXES", 100)
+    t, a, _, tf, z, _ = bridge(20.0)
+    p = play(accel_items(t, a, blocks_of(t)) + fix_items(tf, z), FusionSettings(start_s=3600))
+    assert p.kinds() == ["START"]
+    assert p.events[0].t_ns - T0 == pytest.approx(10 * S, abs=S // 2)
 
 
 def test_displacement_and_bias_follow_the_truth() -> None:

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -66,6 +67,16 @@ def test_one_that_does_not_end_gives_one_clip_of_the_longest_length_and_the_next
     w.begin("b", 155 * S)
     w.end("b", 156 * S)
     assert jobs(w, range(156, 300)) == [(150.0, 176.0, ("b",))]
+
+
+def test_what_is_told_late_and_lies_in_the_last_clip_makes_no_other() -> None:
+    w = watch()
+    w.moment("f", 100 * S)
+    assert jobs(w, range(100, 200)) == [(90.0, 120.0, ("f",))]
+    w.moment("loss", 95 * S)
+    assert jobs(w, range(200, 300)) == []
+    w.moment("loss", 101 * S)
+    assert jobs(w, range(300, 400)) == [(120.0, 121.0, ("loss",))]
 
 
 def test_what_is_open_at_the_end_is_kept_as_far_as_it_came() -> None:
@@ -149,7 +160,7 @@ def test_a_clip_holds_every_record_of_its_interval_over_files_and_clock_steps(tm
     assert "previous_name" not in run
     assert [a.name for a in reader.read_attachments(path)] == ["c.yaml"]
     (told,) = c.faults
-    assert (told.kind, told.text, told.values[0]) == ("CLIP", f"{path.name}: 41.0 s, sag", ("seconds", 41.0))
+    assert (told.kind, told.text, told.values[0]) == ("CLIP", f"{path.name}: 40.0 s, sag", ("seconds", 40.0))
     assert reader.info(path).complete
 
 
@@ -195,6 +206,53 @@ def test_retention_does_not_touch_clips(tmp_path: Path) -> None:
     assert texts(files(c)[0]) == list(range(50, 60))
 
 
+def test_a_file_that_is_renamed_while_a_clip_waits_for_it_is_looked_for_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[Path] = []
+
+    def newest(path: Path) -> int:
+        looks.append(path)
+        if len(looks) == 1:
+            raise FileNotFoundError(2, "No such file or directory", str(path))
+        return reader.newest_ns(path)
+
+    monkeypatch.setattr(clips, "newest_ns", newest)
+    c = made(recorded(tmp_path, 100))
+    monkeypatch.setattr(c.stopping, "wait", lambda seconds: False)
+    c._one(Job(50 * S, 60 * S, ("x",)))
+    assert len(looks) == 2
+    assert [f.kind for f in c.faults] == ["CLIP"]
+
+
+def test_a_file_that_gets_its_final_name_while_others_are_copied_is_in_the_clip(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = recorded(tmp_path, 100)  # begun at 0 and 60 s, the second is open
+    read = clips.read_between
+
+    def slow(path: Path, begin_ns: int, end_ns: int) -> Iterator[reader.Stored]:
+        yield from read(path, begin_ns, end_ns)
+        if len(list(tmp_path.glob("*.mcap"))) == 1:
+            recorder.close()
+
+    monkeypatch.setattr(clips, "read_between", slow)
+    c = made(recorder)
+    c._one(Job(50 * S, 70 * S, ("x",)))
+    assert [f.kind for f in c.faults] == ["CLIP"]
+    assert texts(files(c)[0]) == list(range(50, 70))
+
+
+def test_a_clip_says_how_much_is_in_it(tmp_path: Path) -> None:
+    """The agent began after the interval, or ended before it."""
+    c = made(recorded(tmp_path, 100))
+    c.stopping.set()
+    for begin, end in ((50, 60), (-20, 10), (90, 140), (200, 210)):
+        c._one(Job(begin * S, end * S, ("x",)))
+    assert [dict(f.values)["seconds"] for f in c.faults] == [9, 9, 9, 0]
+    assert ".mcap: 9.0 s, x" in c.faults[1].text
+
+
 def test_a_disk_that_refuses_leaves_no_half_clip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     c = made(recorded(tmp_path, 100))
 
@@ -238,20 +296,26 @@ def test_the_hook_gets_the_clip_and_the_names_and_no_shell_reads_it(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("argv", "said"),
+    ("argv", "hook_s", "said"),
     [
-        (("/bin/sh", "-c", "exit 3"), "/bin/sh: exit code 3"),
-        (("/no/such/program",), "/no/such/program: No such file or directory"),
-        (("/bin/sh", "-c", "sleep 1000 & sleep 1000"), "/bin/sh: killed: it took longer than 0.2 s"),
+        (("/bin/sh", "-c", "exit 3"), 60.0, "/bin/sh: exit code 3"),
+        (("/no/such/program",), 60.0, "/no/such/program: No such file or directory"),
+        (("/bin/true", "a\0b"), 60.0, "/bin/true: embedded null byte"),
+        (("/bin/sh", "-c", "sleep 1000 & sleep 1000"), 0.2, "/bin/sh: killed: it took longer than 0.2 s"),
     ],
 )
-def test_a_hook_that_fails_or_hangs_is_a_fault(tmp_path: Path, argv: tuple[str, ...], said: str) -> None:
-    c, _ = hooked(tmp_path, *argv, hook_s=0.2)
+def test_a_hook_that_fails_or_hangs_is_a_fault(tmp_path: Path, argv: tuple[str, ...], hook_s: float, said: str) -> None:
+    c, _ = hooked(tmp_path, *argv, hook_s=hook_s)
     assert [(f.kind, f.text) for f in c.faults][1:] == [("HOOK_FAILED", said)]
 
 
-def test_what_a_hook_started_ends_with_it(tmp_path: Path) -> None:
-    code = f"sleep 1000 & echo $! > {tmp_path}/pid; sleep 1000"
+def test_what_a_hook_started_ends_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = f"sleep 1000 & echo $! > {tmp_path}/new; mv {tmp_path}/new {tmp_path}/pid; sleep 1000"
+
+    def monotonic() -> float:  # the hook's time is over once it has done what the test looks at
+        return 1000.0 if (tmp_path / "pid").exists() else 0.0
+
+    monkeypatch.setattr(clips, "time", SimpleNamespace(monotonic=monotonic, monotonic_ns=time.monotonic_ns))
     c, _ = hooked(tmp_path, "/bin/sh", "-c", code, hook_s=0.5)
     assert [f.kind for f in c.faults] == ["CLIP", "HOOK_FAILED"]
     child = int((tmp_path / "pid").read_text())

@@ -16,13 +16,14 @@ import numpy.typing as npt
 import pytest
 
 from edge_agent.__main__ import main
-from edge_agent.messages import S
+from edge_agent.messages import Mode, S
 from edge_agent.review import charts, spectra
 from edge_agent.review.charts import Plot, Scale, limits, ticks, time_scale
 from edge_agent.review.figures import as_json
-from edge_agent.review.gather import SPANS, Averaged, Extreme, Moments, Review, gather
+from edge_agent.review.gather import SPANS, Averaged, Extreme, Moments, PointFigures, Review, _point, gather
 from edge_agent.review.panels import PANELS, percent
 from edge_agent.review.report import page
+from edge_agent.review.series import Fused, Piece
 from edge_agent.simulate import SCENARIOS, run
 from edge_agent.simulate.files import write_files
 
@@ -200,7 +201,16 @@ def test_every_axis_has_a_unit(html: str) -> None:
         if 'data-values="1"' in figure:
             unit = re.search(r'class="unit">([^<]+)<', figure)
             assert unit
-            assert unit[1] in ("mm", "ms", "satellites", "ratio", "m/s\u00b2", "(m/s\u00b2)\u00b2/Hz", "mm\u00b2/Hz")
+            assert unit[1] in (
+                "mm",
+                "ms",
+                "Hz",
+                "satellites",
+                "ratio",
+                "m/s\u00b2",
+                "(m/s\u00b2)\u00b2/Hz",
+                "mm\u00b2/Hz",
+            )
             assert figure.split('class="yt">')[1].split("</div>")[0].count("<span") >= 2
         assert figure.split('class="xt">')[1].count("<span") >= 2
 
@@ -220,8 +230,9 @@ def test_the_page_shows_the_numbers_of_the_twin(
 
 
 def test_damaged_files_are_named_and_the_rest_is_told(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("edge_agent.review.gather._questions", lambda p: None)  # slow, and asked above
     whole = recording.read_bytes()
     (tmp_path / "good.mcap").write_bytes(whole)
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 6 // 10])
@@ -264,10 +275,10 @@ def test_a_month_is_as_large_as_a_minute(gathered: Review, recording: Path) -> N
     p, point, x = r.points["deck"], r.overview.points["deck"], r.overview.receivers["rover"]
     rng = np.random.default_rng(1)
     n, spike = 5_000, 0.5
-    for k in range(120):  # six hours each, then a single sample far off
-        t = begin + k * day // 4 + np.arange(n) * (day // 4 // n)
+    for k in range(60):  # half a day each, then a single sample far off
+        t = begin + k * day // 2 + np.arange(n) * (day // 2 // n)
         d = 0.01 * rng.standard_normal((n, 3))
-        if k == 77:
+        if k == 37:
             d[4321] = spike
         point.displacement.add(t, d)
         p.valid.add(t)
@@ -295,6 +306,41 @@ def test_a_month_is_as_large_as_a_minute(gathered: Review, recording: Path) -> N
 # -------------------------------------------------------------------------------------------------------------- parts
 
 
+def piece(t: npt.NDArray[np.int64], d: F64, mode: npt.NDArray[np.uint8]) -> Piece:
+    """Fused samples of a point, and nothing else."""
+    sd = np.full((len(t), 3), 0.001) + np.arange(len(t))[:, None] * 1e-9
+    fused = Fused(t, d, d, sd, sd, mode, np.zeros(len(t), np.uint8))
+    return Piece(Path("x.mcap"), "run", False, {"deck": fused}, {}, {}, {}, [])
+
+
+def test_what_is_not_valid_counts_for_nothing_and_a_close_look_holds_every_sample() -> None:
+    n, begin = 6000, 1_780_300_800 * S
+    t = begin + np.arange(n) * 10_000_000
+    rng = np.random.default_rng(4)
+    d = 0.001 * rng.standard_normal((n, 3))
+    d[2995] = 0.1  # close to the border of two pieces
+    mode = np.full(n, Mode.FUSED, np.uint8)
+    mode[1000:2000] = Mode.INVALID
+    d[1500] = -50.0
+    mode[4000:5000] = Mode.COAST
+    p = PointFigures("", "")
+    for k in range(0, n, 500):
+        _point(p, piece(t[k : k + 500], d[k : k + 500], mode[k : k + 500]), "deck", Averaged(8.0), Averaged(8.0))
+    assert p.moments.n == 5000
+    assert p.valid.covered_ns / S == pytest.approx(49.98, abs=0.011)
+    assert [m for _, _, m in p.spells] == [Mode.FUSED, Mode.INVALID, Mode.FUSED, Mode.COAST, Mode.FUSED]
+    for axis in range(3):
+        high, low = p.high[axis], p.low[axis]
+        assert high is not None
+        assert low is not None
+        assert (high.value_m, high.utc_ns) == (0.1, t[2995])
+        assert low.value_m > -0.01
+        look = p.looks[axis, True]
+        around = (np.abs(t - t[2995]) <= 6 * S) & (mode != Mode.INVALID)
+        assert np.array_equal(look.utc_ns, t[around])
+        assert np.array_equal(look.displacement_m, d[around, axis])
+
+
 def test_the_average_of_parts_is_welchs() -> None:
     rng = np.random.default_rng(2)
     x = rng.standard_normal((48_000, 3)).cumsum(axis=0)
@@ -317,6 +363,23 @@ def test_the_average_of_parts_is_welchs() -> None:
     assert np.allclose(other.psd, one.psd)
     assert np.allclose(other.low, one.low, rtol=1e-4)
     assert np.allclose(other.high, one.high, rtol=1e-4)
+
+
+def test_a_frequency_is_tracked_in_time_in_bounded_memory() -> None:
+    rate, n = 20.0, 20 * 60 * 1000
+    seconds = np.arange(n) / rate
+    f = 1.0 - 0.03 * seconds / seconds[-1]
+    x = np.sin(2 * np.pi * np.cumsum(f) / rate)[:, None] * np.ones(3)
+    x = x + 0.3 * np.random.default_rng(5).standard_normal((n, 3))
+    a = Averaged(20.0)
+    t = np.rint(seconds * S).astype(np.int64)
+    for k in range(0, n, 1200):
+        a.add("run", t[k : k + 1200], x[k : k + 1200])
+    assert a.spectrum() is not None
+    middles, found = a.track([0.985, 5.0])
+    assert 200 <= len(middles) <= 400
+    assert np.abs(found[:, 0] - np.interp(middles, t, f)).max() < 0.01
+    assert np.isnan(found[:, 1]).mean() > 0.8
 
 
 def test_moments_of_parts() -> None:
