@@ -11,11 +11,15 @@ from types import TracebackType
 from typing import Any
 
 from edge_agent import assemble, config, runtime
-from edge_agent.messages import Config, Fault, Raw
+from edge_agent.messages import Config, Fault, Raw, Tick
 from edge_agent.recording import topics
 from edge_agent.recording.reader import Stored, read_messages
 from edge_agent.recording.segments import Recorder
+from edge_agent.simulate import SCENARIOS
+from edge_agent.simulate.encode import config_yaml, dbc_text
+from edge_agent.simulate.specs import EPOCH_UTC_NS, START_NS
 
+GNSS, CAN, CLOCK = "gnss", "can", "clock"
 PATIENCE_S = 60.0
 """How long a test waits for what must come; only a broken program or a machine at its end takes so long."""
 
@@ -75,6 +79,23 @@ class ScriptedPort:
         with self._change:
             self._items.append(error)
             self._change.notify_all()
+
+
+def settings(folder: Path, *sets: str) -> Config:
+    """The simulator's clean bridge, recorded below `folder`."""
+    text = config_yaml(SCENARIOS["clean"], dbc="a.dbc", site="site", data_dir="rec")
+    dbc = dbc_text(SCENARIOS["clean"]).encode()
+    return config.parse(text, folder, lambda name: dbc, ["record.free_gb=0", "record.flush_s=0.05", *sets])
+
+
+def ports() -> dict[str, ScriptedPort]:
+    """Its ports."""
+    return {GNSS: ScriptedPort(), CAN: ScriptedPort(), CLOCK: ScriptedPort()}
+
+
+def tick(t_ns: int) -> Raw:
+    """What its clock says at a monotonic time."""
+    return Raw(t_ns, 0, CLOCK, Tick(t_ns - START_NS + EPOCH_UTC_NS, True, 0))
 
 
 class Live:

@@ -10,43 +10,44 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from live import Live, ScriptedPort, decoded, faults, ledgers, raws, recordings, stored, until, values
+from live import (
+    CAN,
+    CLOCK,
+    GNSS,
+    Live,
+    decoded,
+    faults,
+    ledgers,
+    ports,
+    raws,
+    recordings,
+    settings,
+    stored,
+    tick,
+    until,
+    values,
+)
 
 from drivers import PortError
-from edge_agent import assemble, config, reading, writing
-from edge_agent.messages import MS, Config, Fault, Raw, Record, Rotate, S, Tick
+from edge_agent import assemble, reading, writing
+from edge_agent.messages import MS, Fault, Raw, Record, Rotate, S
 from edge_agent.pipeline import Pipeline
 from edge_agent.queues import ByteQueue
 from edge_agent.reading import Account, Arrival, PortWatch, Reader
 from edge_agent.recording.reader import read_messages
 from edge_agent.recording.segments import Recorder
 from edge_agent.replay import replay
-from edge_agent.simulate import SCENARIOS, simulate
-from edge_agent.simulate.encode import config_yaml, dbc_text, raw_blocks
+from edge_agent.simulate import simulate
+from edge_agent.simulate.encode import raw_blocks
 from edge_agent.simulate.specs import EPOCH_UTC_NS, START_NS
 
 DERIVED = ("/gnss/", "/accel/", "/fusion/", "/events")
 SECONDS = 35.0
-GNSS, CAN, CLOCK = "gnss", "can", "clock"
 
 
 @pytest.fixture(scope="module")
 def script() -> list[Raw]:
     return list(raw_blocks(simulate("clean", 1, SECONDS)))
-
-
-def settings(folder: Path, *sets: str) -> Config:
-    text = config_yaml(SCENARIOS["clean"], dbc="a.dbc", site="site", data_dir="rec")
-    dbc = dbc_text(SCENARIOS["clean"]).encode()
-    return config.parse(text, folder, lambda name: dbc, ["record.free_gb=0", "record.flush_s=0.05", *sets])
-
-
-def ports() -> dict[str, ScriptedPort]:
-    return {GNSS: ScriptedPort(), CAN: ScriptedPort(), CLOCK: ScriptedPort()}
-
-
-def tick(t_ns: int) -> Raw:
-    return Raw(t_ns, 0, CLOCK, Tick(t_ns - START_NS + EPOCH_UTC_NS, True, 0))
 
 
 def derived(files: Sequence[Path]) -> list[tuple[str, int, int, bytes]]:

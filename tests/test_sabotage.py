@@ -17,13 +17,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from live import PATIENCE_S, Live, ScriptedPort, decoded, faults, ledgers, raws, recordings, stored, until, values
+from live import (
+    CAN,
+    CLOCK,
+    GNSS,
+    PATIENCE_S,
+    Live,
+    decoded,
+    faults,
+    ledgers,
+    ports,
+    raws,
+    recordings,
+    settings,
+    stored,
+    until,
+    values,
+)
 
 import drivers.serial_port
 from drivers.serial_port import SerialPort
-from edge_agent import config, reading, writing
+from edge_agent import reading, writing
 from edge_agent.__main__ import main
-from edge_agent.messages import Config, PortSettings, Raw, Record, Rotate, S, Tick
+from edge_agent.messages import PortSettings, Raw, Record, Rotate, S, Tick
 from edge_agent.recording import segments, topics, writer
 from edge_agent.recording.reader import CHUNK, DamagedError, info, parts, read_metadata
 from edge_agent.replay import replay
@@ -33,23 +49,12 @@ from edge_agent.simulate.play import Sink, Slcan, Terminal, can_schedule, play, 
 from edge_agent.simulate.specs import START_NS
 from edge_agent.verify import verify
 
-GNSS, CAN, CLOCK = "gnss", "can", "clock"
 SCENARIO = SCENARIOS["clean"]
 
 
 @pytest.fixture(scope="module")
 def script() -> list[Raw]:
     return list(raw_blocks(simulate("clean", 1, 35.0)))
-
-
-def settings(folder: Path, *sets: str) -> Config:
-    text = config_yaml(SCENARIO, dbc="a.dbc", site="site", data_dir="rec")
-    dbc = dbc_text(SCENARIO).encode()
-    return config.parse(text, folder, lambda name: dbc, ["record.free_gb=0", "record.flush_s=0.05", *sets])
-
-
-def ports() -> dict[str, ScriptedPort]:
-    return {GNSS: ScriptedPort(), CAN: ScriptedPort(), CLOCK: ScriptedPort()}
 
 
 def lost_at_the_disk(files: list[Path]) -> dict[str, int]:

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from live import Live, ScriptedPort, faults, recordings, until
+from live import CAN, CLOCK, GNSS, Live, faults, ports, recordings, settings, until
 
 from edge_agent import __main__ as cli
-from edge_agent import config, observe, watch
+from edge_agent import observe, watch
 from edge_agent import status as st
-from edge_agent.messages import MS, Config, Estimate, Innovation, Raw, S, Tick, Verdict
-from edge_agent.simulate import SCENARIOS, simulate
-from edge_agent.simulate.encode import config_yaml, dbc_text, raw_blocks
+from edge_agent.messages import MS, Estimate, Innovation, Raw, S, Verdict
+from edge_agent.simulate import simulate
+from edge_agent.simulate.encode import raw_blocks
 from edge_agent.simulate.specs import EPOCH_UTC_NS, START_NS
 
 NOW = 1_780_302_645 * S  # 2026-06-01 08:30:45 UTC
@@ -557,26 +557,10 @@ def test_watching_without_a_terminal_or_a_status_is_plain(monkeypatch: pytest.Mo
 
 # ------------------------------------------------------------------------------------------------------- a live agent
 
-GNSS, CAN, CLOCK = "gnss", "can", "clock"
-
 
 @pytest.fixture(scope="module")
 def script() -> list[Raw]:
     return list(raw_blocks(simulate("clean", 1, 25.0)))
-
-
-def settings(folder: Path, *sets: str) -> Config:
-    text = config_yaml(SCENARIOS["clean"], dbc="a.dbc", site="site", data_dir="rec")
-    dbc = dbc_text(SCENARIOS["clean"]).encode()
-    return config.parse(text, folder, lambda name: dbc, ["record.free_gb=0", "record.flush_s=0.05", *sets])
-
-
-def ports() -> dict[str, ScriptedPort]:
-    return {GNSS: ScriptedPort(), CAN: ScriptedPort(), CLOCK: ScriptedPort()}
-
-
-def tick(t_ns: int) -> Raw:
-    return Raw(t_ns, 0, CLOCK, Tick(t_ns - START_NS + EPOCH_UTC_NS, True, 0))
 
 
 def written(live: Live, folder: Path, ticks: int) -> st.Status:

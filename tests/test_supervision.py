@@ -10,20 +10,33 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from live import Live, ScriptedPort, faults, ledgers, raws, recordings, until, values
+from live import (
+    CAN,
+    CLOCK,
+    GNSS,
+    Live,
+    ScriptedPort,
+    faults,
+    ledgers,
+    ports,
+    raws,
+    recordings,
+    settings,
+    tick,
+    until,
+    values,
+)
 
 from drivers import PortError
-from edge_agent import config, reading, runtime
-from edge_agent.messages import MS, Config, Raw, Record, Rotate, S, Tick
+from edge_agent import reading, runtime
+from edge_agent.messages import MS, Raw, Record, Rotate, S
 from edge_agent.queues import ByteQueue
 from edge_agent.reading import PortWatch, payload_size
 from edge_agent.recording.segments import Recorder
 from edge_agent.replay import replay
-from edge_agent.simulate import SCENARIOS, simulate
-from edge_agent.simulate.encode import config_yaml, dbc_text, raw_blocks
+from edge_agent.simulate import simulate
+from edge_agent.simulate.encode import raw_blocks
 from edge_agent.simulate.specs import EPOCH_UTC_NS, START_NS
-
-GNSS, CAN, CLOCK = "gnss", "can", "clock"
 
 
 @pytest.fixture(scope="module")
@@ -31,19 +44,8 @@ def script() -> list[Raw]:
     return list(raw_blocks(simulate("clean", 1, 12.0)))
 
 
-def settings(folder: Path, *sets: str) -> Config:
-    text = config_yaml(SCENARIOS["clean"], dbc="a.dbc", site="site", data_dir="rec")
-    dbc = dbc_text(SCENARIOS["clean"]).encode()
-    return config.parse(text, folder, lambda name: dbc, ["record.free_gb=0", "record.flush_s=0.05", *sets])
-
-
-def ports() -> dict[str, ScriptedPort]:
-    return {GNSS: ScriptedPort(), CAN: ScriptedPort(), CLOCK: ScriptedPort()}
-
-
-def tick(second: int) -> Raw:
-    t_ns = START_NS + second * S
-    return Raw(t_ns, 0, CLOCK, Tick(t_ns - START_NS + EPOCH_UTC_NS, True, 0))
+def tick_of(second: int) -> Raw:
+    return tick(START_NS + second * S)
 
 
 class Time:
@@ -97,22 +99,22 @@ def test_a_writer_that_hangs_is_a_fault_after_5_s_with_its_end(
         live.play(script[:60])
         live.settle()
         gated.gate.clear()
-        live.play([tick(3)], step=True)
+        live.play([tick_of(3)], step=True)
         assert gated.waiting.wait(60)
         time.ns += 5 * S
-        live.play([tick(4)], step=True)
+        live.play([tick_of(4)], step=True)
         assert not any("WRITER_STALLED" in line for line in live.said)
         for more in (1, 30, 60):
             time.ns += more * S
-            live.play([tick(5 + more)], step=True)
+            live.play([tick_of(5 + more)], step=True)
         assert [line for line in live.said if "WRITER" in line] == [
             "recorder: WRITER_STALLED: the disk has not answered for 6 s; records wait in memory"
         ]
         gated.gate.set()
         live.settle()
-        live.play([tick(70)], step=True)
+        live.play([tick_of(70)], step=True)
         live.settle()
-        live.play([tick(71)], step=True)
+        live.play([tick_of(71)], step=True)
     files = recordings(tmp_path / "rec")
     assert kinds(files, "recorder") == ["WRITER_STALLED", "WRITER_OK"]
     assert values(faults(files, "WRITER_STALLED")[0])["stalled_s"] == 6
@@ -134,7 +136,7 @@ def test_memory_is_bounded_while_the_writer_hangs(
         for second in range(3, 60):
             for raw in (r for r in script if START_NS + 3 * S < r.t_ns <= START_NS + 4 * S and r.source != CLOCK):
                 live.play([replace(raw, t_ns=raw.t_ns + (second - 3) * S)], step=True)
-            live.play([tick(second)], step=True)
+            live.play([tick_of(second)], step=True)
             most = max(most, live.agent.outbox.bytes)
             if second == 30:
                 after_half = most
@@ -143,7 +145,7 @@ def test_memory_is_bounded_while_the_writer_hangs(
         assert live.agent.accounts[CLOCK].refused > 20
         gated.gate.set()
         live.settle()
-        live.play([tick(60)], step=True)
+        live.play([tick_of(60)], step=True)
         live.settle()
     files = recordings(tmp_path / "rec")
     assert live.balance() == {}
@@ -195,8 +197,8 @@ def test_a_block_that_the_writer_forgets_is_a_fault(script: list[Raw], tmp_path:
         live.play(script[60:80], step=True)
         live.settle()
         until(lambda: live.agent.writer.books[GNSS].taken > live.agent.writer.books[GNSS].written, "closed books")
-        live.play([tick(9)], step=True)
-        live.play([tick(10)], step=True)
+        live.play([tick_of(9)], step=True)
+        live.play([tick_of(10)], step=True)
     (fault,) = faults(recordings(tmp_path / "rec"), "LEDGER")
     assert (fault["source"], values(fault)["missing"]) == (GNSS, 1)
 
@@ -206,16 +208,16 @@ def test_a_held_block_that_vanishes_from_the_ring_is_a_fault(tmp_path: Path, scr
         live.play(script[:60], step=True)
         live.settle()
         until(lambda: live.agent.writer.books[CAN].ring > 5, "blocks in the ring")
-        live.play([tick(9)], step=True)
+        live.play([tick_of(9)], step=True)
         assert not any("LEDGER" in line for line in live.said)
         ring = live.agent.writer._ring
         live.settle()
         ring.remove(next(r for r in ring if isinstance(r, Record) and r.topic == f"/raw/{CAN}"))
-        live.play([tick(10)], step=True)
+        live.play([tick_of(10)], step=True)
         live.settle()
         before = live.agent.writer.books
         until(lambda: live.agent.writer.books is not before, "closed books")
-        live.play([tick(11)], step=True)
+        live.play([tick_of(11)], step=True)
         assert sum("LEDGER: 1 blocks" in line for line in live.said) == 1
 
 
@@ -264,10 +266,10 @@ def test_a_silent_bus_is_opened_again_and_a_working_port_is_left_alone(script: l
     made = ports()
     fixes = [r for r in script if r.source == GNSS]
     with Live(settings(tmp_path), made) as live:
-        live.play([tick(0)], step=True)
+        live.play([tick_of(0)], step=True)
         until(lambda: made[CAN].counters["opens"] == 1, "the bus is open")
         for second in range(1, 60):
-            live.play([fixes[second], tick(second)], step=True)
+            live.play([fixes[second], tick_of(second)], step=True)
             if second in (16, 36):
                 opens = 2 if second == 16 else 3
                 until(lambda n=opens: made[CAN].counters["opens"] == n, "the bus is open again")
@@ -275,7 +277,7 @@ def test_a_silent_bus_is_opened_again_and_a_working_port_is_left_alone(script: l
         assert live.agent.accounts[CAN].reopened == 2
         assert made[CAN].counters["closes"] == 2
         live.play([r for r in script if r.source == CAN][:5], step=True)
-        live.play([tick(60)], step=True)
+        live.play([tick_of(60)], step=True)
         assert live.agent.accounts[CAN].received == 5
     files = recordings(tmp_path / "rec")
     assert kinds(files, CAN) == ["SILENT", "PORT_REOPEN", "OK"]
@@ -306,18 +308,18 @@ def test_a_reader_that_hangs_is_replaced_alone(script: list[Raw], tmp_path: Path
         return fresh
 
     with Live(settings(tmp_path), {**made, CAN: stuck}, now=time, make_port=make_port) as live:
-        live.play([tick(0)], step=True)
+        live.play([tick_of(0)], step=True)
         assert stuck.entered.wait(60)
         old = live.agent.readers[CAN]
         pass_by(live, time, 30, GNSS)
-        live.play([tick(1)], step=True)
+        live.play([tick_of(1)], step=True)
         assert asked == []
         pass_by(live, time, 1, GNSS)
-        live.play([tick(2)], step=True)
+        live.play([tick_of(2)], step=True)
         assert asked == [CAN]
         made[CAN] = live.ports = {**live.ports, CAN: fresh}  # type: ignore[assignment]
         live.play([r for r in script if r.source == CAN][:5], step=True)
-        live.play([tick(3)], step=True)
+        live.play([tick_of(3)], step=True)
         assert asked == [CAN]
         stuck.free.set()
         old.join(60)
@@ -359,7 +361,7 @@ def test_a_stop_waits_for_hung_readers_together_not_for_one_after_the_other(
             clock.ns += int((timeout or 0.0) * S)
 
     with Live(settings(tmp_path), {**ports(), **stuck}) as live:
-        live.play([tick(0)], step=True)
+        live.play([tick_of(0)], step=True)
         for port in stuck.values():
             assert port.entered.wait(60)
         monkeypatch.setattr(reading.Reader, "join", join)
@@ -380,11 +382,11 @@ def test_no_more_than_three_readers_of_a_port_hang(tmp_path: Path) -> None:
         return all_stuck[-1]
 
     with Live(settings(tmp_path), {**ports(), CAN: all_stuck[0]}, now=time, make_port=make_port) as live:
-        live.play([tick(0)], step=True)
+        live.play([tick_of(0)], step=True)
         for second in range(1, 10):
             assert all_stuck[-1].entered.wait(60)
             pass_by(live, time, 31, GNSS)
-            live.play([tick(second)], step=True)
+            live.play([tick_of(second)], step=True)
         assert len(all_stuck) == 1 + reading.HUNG_MOST
         for port in all_stuck:
             port.free.set()
@@ -403,10 +405,10 @@ def test_the_status_of_a_stalled_disk_and_a_hung_port_says_so(
         assert stuck.entered.wait(60)
         live.settle()
         gated.gate.clear()
-        live.play([tick(3)], step=True)
+        live.play([tick_of(3)], step=True)
         assert gated.waiting.wait(60)
         pass_by(live, time, 31, GNSS)
-        live.play([tick(4)], step=True)
+        live.play([tick_of(4)], step=True)
         at = EPOCH_UTC_NS + 4 * S
         until(lambda: st.load([run])[1].written_utc_ns == at, "the status of a stalled disk")
         s = st.load([run])[1]
