@@ -276,6 +276,8 @@ def test_what_somebody_should_see_to() -> None:
     assert told(ports=(replace(s.ports[0], unaccounted=2),)) == ["ledger: 2 blocks of gnss unaccounted for"]
     assert told(points=(point("mid", mode="INVALID", valid=False),)) == ["point mid INVALID: not valid"]
     assert told(points=(point("mid", mode="GNSS_ONLY"),)) == ["point mid goes on without deck"]
+    (level,) = told(points=(point("mid", flags=("JUMP_OPEN",)),))
+    assert level == "point mid: its fixes stand on another level; they or the estimate are wrong"
     assert told(points=(point("mid", valid=False, age_s=40.0),)) == ["point mid: no estimate for 40 s"]
     assert told(points=(point("mid", receiver=None, mode="ACCEL_ONLY", valid=False),)) == []
     assert told(losses=(st.Loss("disk", "/raw/can", 12, 3.0),)) == ["lost at disk: 12 blocks of can"]
