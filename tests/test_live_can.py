@@ -105,9 +105,8 @@ def test_through_an_slcan_adapter(folder: Path, tmp_path: Path, monkeypatch: pyt
     assert ledger["dropped_inbox"] == ledger["refused_outbox"] == ledger["dropped_kernel"] == 0
     report = replay(files, None, None, True)
     assert report.ok, str(report)
-    # How many is the machine's affair: a block is whatever one read found waiting.
-    blocks = len(stored(files, "/accel/imu/block"))
-    assert report.compared == report.derived > blocks > 1
+    # Into how many blocks they fell is the machine's affair: a block is whatever one read found waiting, even all.
+    assert report.compared == report.derived >= len(stored(files, "/accel/imu/block")) > 0
 
 
 def test_through_import_and_replay(folder: Path, tmp_path: Path) -> None:
