@@ -262,6 +262,20 @@ def _review(args: argparse.Namespace) -> int:
     return LOSS if found.damaged else GOOD
 
 
+def _layouts(args: argparse.Namespace) -> int:
+    from edge_agent import layouts
+    from edge_agent.replay import ReplayError
+    from edge_agent.review.series import configuration, files_of
+
+    try:
+        written = layouts.write(configuration(files_of(args.inputs)[0]), args.output)
+    except ReplayError as e:
+        raise WrongUseError(f"layouts: {e}") from None
+    for path in written:
+        print(path)
+    return GOOD
+
+
 def _cat(args: argparse.Namespace) -> int:
     from edge_agent import cat
 
@@ -521,6 +535,15 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("inputs", nargs="+", type=Path, metavar="FOLDER|FILE")
     p.add_argument("-o", "--output", type=Path, metavar="REPORT.html", help="the page; it needs nothing but itself")
     json_flag(p)
+
+    p = add(
+        "layouts",
+        _layouts,
+        "layouts of Lichtblick (Foxglove) and PlotJuggler that open on displacement, gate, spectrum, map and log",
+        "edge-agent layouts rec/*.mcap -o viewers/",
+    )
+    p.add_argument("inputs", nargs="+", type=Path, metavar="FOLDER|FILE", help="recordings, for the names in them")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
 
     p = add(
         "cat",
