@@ -24,10 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
+from edge_agent import layouts
 from edge_agent.geodesy import Frame
 from edge_agent.messages import F64, I64, MS, U8, VALID_MODES, S, Verdict
 from edge_agent.recording import cdr, reader, topics
 from edge_agent.review.report import review
+from edge_agent.review.series import configuration
 from edge_agent.simulate.bridge import SimRecord, run
 from edge_agent.simulate.encode import RECEIVER, Wiring, config_yaml, dbc_text, point_name
 from edge_agent.simulate.play import Sink, Terminal, can_schedule, open_can, play, serial_schedule, wait_ready
@@ -123,6 +125,8 @@ def run_demo(out_dir: Path, seconds: float = 60.0, seed: int = 1) -> int:
     report = folder / "report.html"
     review([folder / "recordings"], report)
     print(f"report   {report}")
+    for path in layouts.write(configuration(files), folder):
+        print(f"layout   {path}")
     for file in files:
         print(f"file     {file}")
     if not figures.better:
