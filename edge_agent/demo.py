@@ -229,7 +229,8 @@ class _Progress:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the files say, structure axes: times in s of the record; samples with d and sd (n, 3), fixes with z (m, 3).
+    """What the files say, structure axes: times in s of the record; samples with d and sd (n, 3), fixes with z (m, 3)
+    at the receiver's own time, which no delay on this machine moves.
 
     `verdict` of a fix: of `Verdict`, 255 where the files hold none.
     """
@@ -251,14 +252,15 @@ def read_back(files: Sequence[Path], record: SimRecord) -> Seen:
     times: list[I64] = [np.zeros(0, np.int64)]
     columns: list[list[F64]] = [[np.zeros((0, 3))], [np.zeros((0, 3))]]
     modes: list[U8] = [np.zeros(0, np.uint8)]
-    fixes: dict[int, Vec3] = {}
+    fixes: dict[int, tuple[int, Vec3]] = {}
     verdicts: dict[int, int] = {}
     frame = Frame(record.scenario.reference_llh, AZIMUTH_DEG)
     for file in files:
         for stored in reader.read_messages(file, wanted):
             if stored.topic == solution:
                 value = cdr.decode(stored.schema, stored.data)
-                fixes[stored.publish_ns] = frame.to_structure((value["east_m"], value["north_m"], value["up_m"]))
+                enu = (value["east_m"], value["north_m"], value["up_m"])
+                fixes[stored.publish_ns] = (value["gnss_utc_ns"] - zero_ns, frame.to_structure(enu))
             elif stored.topic.endswith("/update"):
                 verdicts[stored.publish_ns] = cdr.decode(stored.schema, stored.data)["verdict"]
             else:
@@ -273,8 +275,8 @@ def read_back(files: Sequence[Path], record: SimRecord) -> Seen:
         np.concatenate(columns[0]),
         np.concatenate(columns[1]),
         np.concatenate(modes),
-        (np.array(stamps, dtype=np.int64) - zero_ns) / S,
-        np.array([fixes[t] for t in stamps]).reshape(-1, 3),
+        np.array([fixes[t][0] for t in stamps], dtype=np.int64) / S,
+        np.array([fixes[t][1] for t in stamps]).reshape(-1, 3),
         np.array([verdicts.get(t, 255) for t in stamps], dtype=np.uint8),
     )
 
