@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 JOBS ?= auto
 FAULTS ?= all
 
-.PHONY: demo test lint bench judges vm-test kill-test fuzz soak clean
+.PHONY: demo test lint bench judges real vm-test power-test kill-test fuzz soak clean
 .DEFAULT_GOAL := help
 
 help:
@@ -13,10 +13,12 @@ help:
 	@echo "make test    lint, types and all tests"
 	@echo "make bench   figures against their goals; ROWS=filter,replay chooses, COMPARE=<commit> runs two checkouts in turn"
 	@echo "make judges  our files before readers that nobody here wrote (rerun, @mcap/core)"
+	@echo "make real    whole real records through import, replay and review; minutes, needs ../shared/data"
 	@echo "make kill-test   KILLS=20 SIGKILLs under load, every file recovered and judged; flipped bits too"
 	@echo "make fuzz        MINUTES=1 of spoilt input for each parser; TARGETS=nmea,mcap chooses"
 	@echo "make soak        a simulated month of recording in at most MINUTES=120: memory, descriptors, threads stand still"
-	@echo "make vm-test     the service in a virtual machine, with a table of faults; 10 minutes, 6 with FAULTS=few"
+	@echo "make power-test  CUTS=5 power cuts of the virtual machine under load; about 1.5 minutes each, and 4 to install"
+	@echo "make vm-test     the service in a virtual machine, with a table of faults; 15 minutes, 6 with FAULTS=few"
 
 $(VENV)/.demo: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -49,10 +51,13 @@ test: lint
 	$(BIN)/pytest -n $(JOBS) -q
 
 bench: $(VENV)/.bench
-	$(BIN)/python tests/bench/run.py $(if $(ROWS),--rows $(ROWS)) $(if $(COMPARE),--compare $(COMPARE)) $(BENCH)
+	$(BIN)/python tests/bench/run.py $(if $(ROWS),--rows $(ROWS)) $(if $(COMPARE),--compare $(COMPARE)) $(if $(DAY),--day) $(BENCH)
 
 judges: $(VENV)/.judges
 	$(BIN)/python tests/judges/run.py
+
+real: $(VENV)/.test
+	nice -n 10 $(BIN)/pytest -q tests/review/real_whole.py
 
 KILLS ?= 20
 comma := ,
@@ -65,6 +70,10 @@ fuzz: $(VENV)/.test
 
 soak: $(VENV)/.test
 	nice -n 10 $(BIN)/python tests/faults/soak.py $(or $(MINUTES),120)
+
+CUTS ?= 5
+power-test: $(VENV)/.test
+	$(BIN)/python tests/vm/power.py $(CUTS)
 
 vm-test: $(VENV)/.test
 	nice -n 10 $(BIN)/python tests/vm/run.py --faults $(FAULTS)

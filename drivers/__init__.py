@@ -3,7 +3,7 @@
 A `*_port.py` does I/O and never parses; a `*_codec.py` parses and never does I/O. From edge_agent both import only
 `edge_agent.messages`. Shape, not ancestry:
 
-    port:   __init__(settings), open(), read() -> list of (monotonic ns, payload), close(), counters
+    port:   __init__(settings), open(), read() -> list of (monotonic ns, payload), close(silently=False), counters
     codec:  __init__(...), feed(...), save(), load(state), counters
 
 `open` and `read` of a port raise `PortError`; `read` returns within about 0.5 s, with [] when nothing came.

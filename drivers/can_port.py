@@ -438,11 +438,15 @@ class CanPort:
             raise PortError(f"{self._where()}: lost: {_reason(source.failure)}") from source.failure
         return []
 
-    def close(self) -> None:
-        """Close the bus; twice is fine, and a device that is gone does not matter."""
+    def close(self, silently: bool = False) -> None:
+        """Close the bus; twice is fine, and a device that is gone does not matter. `silently`: without a word to the
+        device, which another port has meanwhile: an slcan adapter would close that one's channel."""
         bus, self._bus, self._source = self._bus, None, None
         if bus is None:
             return
+        if silently and (adapter := getattr(bus, "serialPortOrig", None)) is not None:
+            with contextlib.suppress(OSError):
+                adapter.close()
         with contextlib.suppress(can.CanError, OSError, ValueError):
             bus.shutdown()
         # python-can's slcan writes a last command before it closes, and leaves the file open when that fails

@@ -109,5 +109,5 @@ class ClockPort:
         self._next_ns = following
         return [(mono_ns, Tick(utc_ns, sync, error_ns))]
 
-    def close(self) -> None:
+    def close(self, silently: bool = False) -> None:
         """Nothing is held."""

@@ -188,8 +188,8 @@ class SerialPort:
                 raise OSError(errno.EIO, "the other end closed the connection")
         return b"".join(parts)
 
-    def close(self) -> None:
-        """Idempotent, never raises."""
+    def close(self, silently: bool = False) -> None:
+        """Idempotent, never raises; never says anything to the device."""
         with self._lock:
             self._close()
 

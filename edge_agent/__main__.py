@@ -182,11 +182,61 @@ def _port_and_file(text: str, default: str) -> tuple[str, Path]:
     return m[1], Path(m[2])
 
 
+def _compare(args: argparse.Namespace) -> int:
+    """`replay --compare`: old settings against new ones."""
+    if args.verify:
+        raise WrongUseError("replay: --compare has two settings, --verify none that differ; choose one")
+    if not args.set and not args.config:
+        raise WrongUseError("replay: --compare needs other settings: --set path=value, or -c CONFIG")
+    if args.page.suffix.lower() not in (".html", ".htm"):
+        raise WrongUseError(f"replay: --page {args.page}: the page is HTML, name it so")
+    from edge_agent.config import ConfigError
+    from edge_agent.recording.reader import DamagedError
+    from edge_agent.replay import ReplayError, in_order, recorded_config
+    from edge_agent.review import compare
+
+    talks = sys.stderr.isatty()
+
+    def progress(text: str) -> None:
+        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+
+    try:
+        first = in_order(args.inputs)[0]
+        if args.config:
+            new = _config(args)
+            old = _config(argparse.Namespace(config=args.config)) if args.set else recorded_config(first)
+        else:
+            old, new = recorded_config(first), recorded_config(first, args.set)
+        folder = (args.output or args.page).absolute().parent
+        say = progress if talks else None
+        found = compare.compare(args.inputs, args.output, old, new, args.set, folder, say)
+        if args.smooth:
+            from edge_agent.review.smoothed import add_smoothed
+
+            add_smoothed(args.output)
+    except (ReplayError, ConfigError) as e:
+        raise WrongUseError(f"replay: {e}") from None
+    except DamagedError as e:
+        _say(f"edge-agent: replay: {e}")
+        return WANTING
+    finally:
+        if talks:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    part = args.page.with_name(args.page.name + ".part")
+    part.write_text(compare.page(found), encoding="utf-8")
+    part.replace(args.page)
+    _result(args, compare.as_json(found), compare.as_text(found))
+    _say(f"page {args.page}")
+    return GOOD
+
+
 def _replay(args: argparse.Namespace) -> int:
-    if args.output is None and not args.verify:
-        raise WrongUseError("replay: give -o OUT for a new recording, --verify to compare, or both")
     if args.smooth and args.output is None:
         raise WrongUseError("replay: --smooth writes into the new recording: give -o OUT")
+    if args.compare:
+        return _compare(args)
+    if args.output is None and not args.verify:
+        raise WrongUseError("replay: give -o OUT for a new recording, --verify to compare, or both")
     config = _config(args) if args.config else None
     from edge_agent.config import ConfigError
     from edge_agent.recording.reader import DamagedError
@@ -242,8 +292,10 @@ def _review(args: argparse.Namespace) -> int:
     if args.output is None and not args.json:
         raise WrongUseError("review: give -o REPORT.html for the page, --json for its figures, or both")
     from edge_agent.replay import ReplayError
+    from edge_agent.review import ahead
     from edge_agent.review.report import as_text, review
 
+    ahead.allowed = True
     talks = sys.stderr.isatty()
 
     def progress(text: str) -> None:
@@ -260,6 +312,27 @@ def _review(args: argparse.Namespace) -> int:
     if args.output is not None:
         _say(f"report {args.output}")
     return LOSS if found.damaged else GOOD
+
+
+def _tune(args: argparse.Namespace) -> int:
+    from edge_agent.config import ConfigError
+    from edge_agent.replay import ReplayError
+    from edge_agent.review import tune
+
+    talks = sys.stderr.isatty()
+
+    def progress(text: str) -> None:
+        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+
+    try:
+        found = tune.tune(args.inputs, progress if talks else None)
+    except (ReplayError, ConfigError) as e:
+        raise WrongUseError(f"tune: {e}") from None
+    finally:
+        if talks:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    _result(args, tune.as_json(found), tune.as_text(found))
+    return GOOD
 
 
 def _layouts(args: argparse.Namespace) -> int:
@@ -491,7 +564,8 @@ def _parser() -> argparse.ArgumentParser:
         _replay,
         "run recordings through the same data path again; verify or retune",
         "edge-agent replay --verify rec/*.mcap\n"
-        "  edge-agent replay raw.mcap -c site.yaml --set fusion.gate_alpha=0.01 -o new.mcap",
+        "  edge-agent replay raw.mcap -c site.yaml --set fusion.gate_alpha=0.01 -o new.mcap\n"
+        "  edge-agent replay rec/*.mcap --set fusion.accel_noise_m2ps3=1e-8 --compare --page compare.html",
     )
     p.add_argument("inputs", nargs="+", type=Path, metavar="IN")
     p.add_argument("-o", "--output", type=Path, metavar="OUT")
@@ -502,6 +576,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "--smooth", action="store_true", help="add the smoothed stream, which knows the whole record, to OUT"
+    )
+    p.add_argument(
+        "--compare", action="store_true", help="settings before --set (or -c) against those after: figures and a page"
+    )
+    p.add_argument(
+        "--page", type=Path, default=Path("compare.html"), metavar="PAGE.html", help="of --compare (compare.html)"
     )
     json_flag(p)
 
@@ -534,6 +614,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     p.add_argument("inputs", nargs="+", type=Path, metavar="FOLDER|FILE")
     p.add_argument("-o", "--output", type=Path, metavar="REPORT.html", help="the page; it needs nothing but itself")
+    json_flag(p)
+
+    p = add(
+        "tune",
+        _tune,
+        "would other settings have done better? Maximum likelihood of what was recorded, with sd and the gain",
+        "edge-agent tune /var/lib/edge-agent/recordings",
+    )
+    p.add_argument("inputs", nargs="+", type=Path, metavar="FOLDER|FILE", help="recordings with a fused stream")
     json_flag(p)
 
     p = add(

@@ -26,7 +26,7 @@ import numpy as np
 from edge_agent.messages import CanFlag, CanFrames, S
 from edge_agent.recording import reader, topics
 from edge_agent.recording.schemas import Field, full_name, parse_schema
-from edge_agent.recording.writer import RUN_METADATA
+from edge_agent.recording.writer import PART, RUN_METADATA
 
 UNITS = {
     "ns": "ns",
@@ -347,7 +347,7 @@ def describe(paths: Iterable[Path]) -> tuple[list[dict[str, Any]], bool]:
         )
     wanting = bool(unreadable) or any(
         f["damage"]
-        or not f["complete"]
+        or not (f["complete"] or f["file"].endswith(PART))  # which is being written: read as far as it goes
         or f["missing_blocks"]
         or f["missing_before"]
         or f["continuity"].startswith(CHANGED)
@@ -358,15 +358,14 @@ def describe(paths: Iterable[Path]) -> tuple[list[dict[str, Any]], bool]:
 
 def _missing_before(files: Sequence[Mapping[str, Any]], run: Mapping[str, str]) -> int:
     """How many files of the same run lie between this one and the one of a lower number that was named before it."""
-    number = run.get("segment", "")
+    number = reader.count(run.get("segment", ""))
     same = [
         f["metadata"][RUN_METADATA] for f in files if f["metadata"].get(RUN_METADATA, {}).get("run") == run.get("run")
     ]
-    before = [int(r["segment"]) for r in same if r.get("segment", "").isdecimal()]
-    if not number.isdecimal() or not run.get("run"):
+    if not number or not run.get("run"):
         return 0
-    lower = [n for n in before if n < int(number)]
-    return int(number) - max(lower) - 1 if lower else 0
+    lower = [n for n in (reader.count(r["segment"]) for r in same if r.get("segment")) if n < number]
+    return number - max(lower) - 1 if lower else 0
 
 
 CHANGED = "changed"

@@ -32,7 +32,7 @@ class Port(Protocol):
 
     def open(self) -> None: ...
     def read(self) -> list[tuple[int, Payload]]: ...
-    def close(self) -> None: ...
+    def close(self, silently: bool = False) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class Reader(threading.Thread):
                     self.account.reopened += 1
                     self.port.close()
             except drivers.PortError as e:
-                self.port.close()
+                self._close()
                 self.busy_ns = 0
                 if self.abandoned:
                     return  # the port is another reader's, and so is its state
@@ -114,8 +114,14 @@ class Reader(threading.Thread):
                 self._fault("PORT_LOST", f"{e}; next try in {wait:.0f} s", (("retry_s", wait),))
                 self.stopping.wait(wait)
                 wait = min(2 * wait, BACKOFF_S[1])
-        self.port.close()
+        self._close()
         self.busy_ns = 0
+
+    def _close(self) -> None:
+        if self.abandoned:
+            self.port.close(silently=True)  # the device is another reader's
+        else:
+            self.port.close()
 
     def _offer(self, t_ns: int, payload: Payload) -> None:
         size = payload_size(payload)

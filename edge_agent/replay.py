@@ -23,7 +23,7 @@ from edge_agent import assemble, config
 from edge_agent import messages as m
 from edge_agent.pipeline import Pipeline
 from edge_agent.recording import topics
-from edge_agent.recording.reader import MAGIC, Stored, read_attachments, read_messages, read_metadata
+from edge_agent.recording.reader import MAGIC, Stored, count, read_attachments, read_messages, read_metadata
 from edge_agent.recording.writer import PART, RUN_METADATA, SegmentWriter, fsync_folder
 
 CHECKPOINT = "/raw/checkpoint"
@@ -86,14 +86,17 @@ class Report:
         return "\n".join([*lines, *self.notes])
 
 
-def replay(inputs: Sequence[Path], output: Path | None, settings: m.Config | None, verify: bool) -> Report:
+def replay(
+    inputs: Sequence[Path], output: Path | None, settings: m.Config | None, verify: bool, *, fresh: bool = False
+) -> Report:
     """Replay `inputs` (files or folders) in order of time; write raw and derived records to `output` (one MCAP file).
 
-    `settings` None = the configuration in the recording. Raises ReplayError, OSError, reader.DamagedError.
+    `settings` None = the configuration in the recording. `fresh`: recorded states are not taken over, also where the
+    settings are those of the recording. Raises ReplayError, OSError, reader.DamagedError.
     """
     files = in_order(inputs)
     used = settings or recorded_config(files[0])
-    return _Replay(files, used, verify).run(output)
+    return _Replay(files, used, verify, fresh).run(output)
 
 
 def in_order(inputs: Sequence[Path]) -> list[Path]:
@@ -111,8 +114,7 @@ def in_order(inputs: Sequence[Path]) -> list[Path]:
             first = None if p.stat().st_size == 0 else next(read_messages(p), None)  # empty: killed as it was made
             if first is not None:
                 run = read_metadata(p).get(RUN_METADATA, {})
-                number = run.get("segment", "")
-                found.append((first.log_ns, run.get("run", ""), int(number) if number.isdecimal() else 0, p))
+                found.append((first.log_ns, run.get("run", ""), count(run.get("segment", "")), p))
     if not found:
         raise ReplayError(f"no recording with messages in {', '.join(map(str, inputs)) or 'nothing'}")
     begin: dict[str, int] = {}
@@ -137,8 +139,8 @@ def recorded_config(path: Path, sets: Sequence[str] = ()) -> m.Config:
 
 
 class _Replay:
-    def __init__(self, files: list[Path], settings: m.Config, verify: bool) -> None:
-        self.files, self.settings = files, settings
+    def __init__(self, files: list[Path], settings: m.Config, verify: bool, forget: bool = False) -> None:
+        self.files, self.settings, self.forget = files, settings, forget
         self.report = Report(verify=verify)
         self.pipeline: Pipeline = assemble.pipeline(settings)
         self.fresh = True  # nothing has been stepped
@@ -233,6 +235,8 @@ class _Replay:
             self.pipeline = assemble.pipeline(self.settings)
         self.blind = False
         try:
+            if self.forget:
+                raise ValueError("recorded states are not asked for")
             self.pipeline.load(point.state)
             self.own_state = False
         except ValueError as e:

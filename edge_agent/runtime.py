@@ -19,6 +19,7 @@ stand in `RecordSettings`.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import platform
 import signal
@@ -60,11 +61,14 @@ from edge_agent.recording.clips import Clips
 from edge_agent.recording.segments import Recorder, recover
 from edge_agent.writing import DERIVED_SHARE, MB, Beat, Keep, Writer, free_bytes, note_loss
 
+BOOT_VARIABLE = "EDGE_AGENT_BOOT"
 STALLED_S = 5.0  # the writer is at one operation so long
 STATE_FILE = "state/kept.bin"
 READERS_S = 5.0  # at a stop, what all readers together may take to come back from their drivers
 CLIPS_S = 10.0  # at a stop, what clips may still take
 RESERVE_BYTES = MB  # of the outbox beyond its bound, for Ticks and for what tells of the loss
+M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8  # of malloc.h
+LOSSES_S = 60.0  # how often stderr is told of losses that go on
 HEAD_RECORDS = 64  # Ticks, faults and diagnostics that wait for the first data; then the first file begins without
 
 INFO, WARNING, ERROR = 20, 30, 40
@@ -117,6 +121,8 @@ class Agent:
         self._lost: dict[str, list[int]] = {}  # topic -> [count, first, last log_time], refused by the outbox
         self._dropped: dict[str, int] = dict.fromkeys(ports, 0)  # told so far
         self._kernel: dict[str, int] = {}
+        self._overrun: dict[str, list[int]] = {}  # of that, not yet told: [count, first, last t_ns]
+        self._losses = Losses(say)
         self._watch = {n: PortWatch(config.ports[n].kind) for n in ports if n in config.ports and self._listeners(n)}
         self._stamp = 0  # log_time of what the runtime itself records
         self._tick_ns = 0  # the last second
@@ -127,7 +133,9 @@ class Agent:
         return receivers + [a.name for a in c.accelerometers.values() if a.port == port]
 
     def run(self, found: Sequence[m.Fault] = ()) -> int:
-        """Returns 0 after an orderly stop; raises what a thread raised, after what is in hand has been written.
+        """Returns 0 after an orderly stop, 1 where data came and nothing of it could be written in the whole run, 3
+        where the disk refused at the end and what was lost there is told in no file; raises what a thread raised, after
+        what is in hand has been written.
 
         `found` = faults from before the start, recorded as soon as the time is known.
         """
@@ -154,13 +162,18 @@ class Agent:
                 if self._last_tick is not None:
                     self.publisher.offer(self._status(*self._last_tick, state))
                 self.publisher.close()
+            self._losses.close()
             for f in self.writer.faults:
                 self._print(f"{f.source}: {f.kind}: {f.text}")
             for topic, (count, _, _) in self.writer.lost.items():
                 self._print(f"lost at the disk, and told in no file: {count} of {topic}")
         if self.writer.failure is not None:
             raise self.writer.failure
-        return 0
+        sensors = [a for name, a in self.accounts.items() if name != "clock"]
+        if any(a.received for a in sensors) and not any(a.written for a in sensors):
+            self._print("nothing that came could be recorded")
+            return 1
+        return 3 if any(topic.startswith("/raw/") for topic in self.writer.lost) else 0
 
     def _run(self, found: Sequence[m.Fault]) -> None:
         self.readers["clock"].start()
@@ -221,6 +234,7 @@ class Agent:
 
     def _step(self, arrival: Arrival, payload: Payload, tick: bool) -> None:
         self._rotate_if_due(arrival.t_ns, tick)
+        self._stamped(arrival.t_ns)  # what the runtime says next comes after this block
         raw = m.Raw(arrival.t_ns, self.pipeline.order, arrival.source, payload)
         try:
             records = self.pipeline.step(raw)
@@ -233,7 +247,9 @@ class Agent:
                 self.clips.saw(record, self.pipeline.to_utc(0))
         if isinstance(payload, m.CanFrames) and payload.dropped:
             self._kernel[arrival.source] = self._kernel.get(arrival.source, 0) + payload.dropped
-            self._loss("kernel", arrival.source, payload.dropped, arrival.t_ns, arrival.t_ns)
+            entry = self._overrun.setdefault(arrival.source, [0, arrival.t_ns, arrival.t_ns])
+            entry[0] += payload.dropped
+            entry[2] = arrival.t_ns
 
     def _rotate_if_due(self, t_ns: int, tick: bool) -> None:
         record = self.config.record
@@ -331,7 +347,7 @@ class Agent:
         self.observer.loss(where, source, count, self._tick_ns)
         if self.clips is not None:
             self.clips.fault("LOSS", end_ns)
-        self._print(f"{source}: LOSS: {text}")
+        self._losses.tell(where, source, count, self._tick_ns)
         values = (("count", float(count)),)
         self._own(
             "/faults", topics.event("LOSS", source, text, values, end_ns, stamp, to_utc(begin_ns), to_utc(end_ns))
@@ -353,11 +369,15 @@ class Agent:
                 self._dropped[name] += new
                 now = time.monotonic_ns()
                 self._loss("inbox", name, new, now - m.S, now)
+        overrun, self._overrun = self._overrun, {}
+        for name, (count, begin, end) in overrun.items():
+            self._loss("kernel", name, count, begin, end)
 
     # ----------------------------------------------------------------------------------------------------- each second
 
     def _every_second(self, t_ns: int, utc_ns: int) -> None:
         self._tick_ns = t_ns
+        self._losses.every_second(t_ns)
         self._stamped(t_ns)
         while self.writer.faults and not self.writer.want_rotate:
             self.fault(self.writer.faults.popleft())
@@ -546,7 +566,8 @@ class Agent:
         ]
         pages = pages or self._pages()
         ports = [self._port_status(n, s, pages[n], t_ns) for n, s in self.config.ports.items()]
-        run = self.recorder.metadata.get("run", ""), version("edge-agent"), state
+        said = self.recorder.metadata
+        run = said.get("run", ""), said.get("version", ""), state
         return self.observer.status(t_ns, utc_ns, run, ports, queues, disk)
 
     def _port_status(self, name: str, s: m.PortSettings, page: Page, t_ns: int) -> st.Port:
@@ -575,6 +596,41 @@ class Agent:
             self._kernel.get(name, 0),
             page.unaccounted,
         )
+
+
+class Losses:
+    """What is said of losses on stderr, which a journal keeps: the first of a place at once, then its sum once a
+    minute, and what is left at the end. The recording holds each second's."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._waiting: dict[tuple[str, str], list[int]] = {}  # (where, source) -> [count not yet said, when said last]
+
+    def tell(self, where: str, source: str, count: int, now_ns: int) -> None:
+        """`count` more are lost there."""
+        entry = self._waiting.get((where, source))
+        if entry is None:
+            self._say(f"{source}: LOSS: {count} lost at {where}")
+            self._waiting[where, source] = [0, now_ns]
+        else:
+            entry[0] += count
+
+    def every_second(self, now_ns: int) -> None:
+        """Say what a minute has gathered; of a minute without a loss nothing, and the next loss is a first one."""
+        for (where, source), (count, said_ns) in list(self._waiting.items()):
+            if now_ns - said_ns < LOSSES_S * m.S:
+                continue
+            del self._waiting[where, source]
+            if count:
+                self._say(f"{source}: LOSS: {count} more lost at {where} within {LOSSES_S:.0f} s")
+                self._waiting[where, source] = [0, now_ns]
+
+    def close(self) -> None:
+        """The end: what has not been said."""
+        for (where, source), (count, _) in self._waiting.items():
+            if count:
+                self._say(f"{source}: LOSS: {count} more lost at {where}")
+        self._waiting.clear()
 
 
 @dataclass(frozen=True, slots=True)
@@ -606,9 +662,12 @@ class Page:
 
 
 def boot_id() -> str:
-    """The kernel's name for this boot, so that a kill and a power cut can be told apart later; "" where it has none."""
+    """The kernel's name for this boot, so that a kill and a power cut can be told apart later; "" where it has none.
+    The unit gives it: a service that sees nothing of /proc but processes cannot ask."""
+    if given := os.environ.get(BOOT_VARIABLE, ""):
+        return given.replace("-", "")
     try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip().replace("-", "")
     except OSError:
         return ""
 
@@ -626,12 +685,24 @@ def run_metadata(config: m.Config, run_id: str) -> dict[str, str]:
     }
 
 
+def steady_memory() -> None:
+    """Tell glibc's malloc to keep one arena and to give large blocks back. By default each thread has an arena, which
+    grows to what the hungriest of all threads that ever used it needed (7 MiB in 18 hours of a soak in which readers
+    were replaced), and blocks of the size of a chunk move into the heap for good. The interpreter's lock leaves threads
+    nothing to gain from arenas. Another C library: nothing happens."""
+    with suppress(OSError, AttributeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(M_ARENA_MAX, 1)
+        mallopt(M_MMAP_THRESHOLD, 256 << 10)
+
+
 def run(config: m.Config) -> int:
     """The service: recover, open, read, fuse and record until SIGTERM or SIGINT."""
 
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
+    steady_memory()
     data_dir = Path(config.data_dir)
     pipeline = assemble.pipeline(config)
     now = time.monotonic_ns()

@@ -262,6 +262,10 @@ def from_json(text: str | bytes) -> Status:
     if value["format"] != FORMAT:
         raise StatusError(f"has format {value['format']!r}, this edge-agent reads {FORMAT}: another version runs there")
     status: Status = _built(Status, value, "")
+    for p in status.points:  # the view shows them side by side
+        sizes = {len(x) for x in (p.displacement_m, p.std_displacement_m, p.velocity_mps, p.std_velocity_mps)}
+        if sizes not in ({0}, {3}):  # none, or the three axes of each
+            raise StatusError(f"is a damaged status of edge-agent: the axes of point {p.name!r} are not complete")
     return status
 
 

@@ -17,13 +17,15 @@ silent      the port was open and nothing came
 missing     a file of the run is not here
 unknown     nothing in the recording explains it
 
+Event clips (`clips/` in a folder) are read too: each must be whole and as it was written; they have no chain.
+
 Left out: whether the derived records follow from the raw ones (`replay --verify`).
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -35,6 +37,7 @@ from edge_agent.recording import reader, topics
 from edge_agent.recording.repair import DAMAGED, REPAIRED_METADATA
 from edge_agent.recording.writer import PART, RUN_METADATA
 
+CLIPS = "clips"  # the folder of event clips, in the data folder
 SILENT_S = 5.0  # as the agent itself calls a port silent
 JOIN_NS = 2 * S  # losses of one reason that lie closer are one gap: a LOSS is told once a second
 EXPLAINED = ("stop", "kill", "power", "crash", "disk", "overload", "port lost", "stall", "silent")
@@ -89,8 +92,7 @@ class File:
 
     @property
     def segment(self) -> int:
-        number = self.run.get("segment", "")
-        return int(number) if number.isdecimal() else 0
+        return reader.count(self.run.get("segment", ""))
 
     @property
     def last_raw_ns(self) -> int:
@@ -105,6 +107,7 @@ class Verdict:
     gaps: list[Gap] = field(default_factory=list)
     wanting: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    clips: list[File] = field(default_factory=list)
 
     @property
     def lost(self) -> bool:
@@ -112,10 +115,16 @@ class Verdict:
         return any(g.reason in COSTS for g in self.gaps) or any(f.lost_bytes for f in self.files)
 
 
-def verify(paths: Sequence[Path], progress: Callable[[Path], None] | None = None) -> Verdict:
-    """Look at recordings (files, or folders with all their recordings). Raises OSError for a path that is not there."""
+def verify(
+    paths: Sequence[Path],
+    progress: Callable[[Path], None] | None = None,
+    take: Callable[[Path], File] | None = None,
+) -> Verdict:
+    """Look at recordings (files, or folders with all their recordings). Raises OSError for a path that is not there.
+    `take`: instead of `look`, called for one file after the other."""
     found: list[Path] = []
     notes: list[str] = []
+    clips: list[File] = []
     for path in paths:
         if not path.is_dir():
             path.stat()
@@ -124,6 +133,9 @@ def verify(paths: Sequence[Path], progress: Callable[[Path], None] | None = None
         inside = sorted(path.iterdir())
         found += [p for p in inside if p.name.endswith((".mcap", ".mcap" + PART))]
         notes += [f"{p.name} is the damaged original of a repaired file" for p in inside if _is_damaged(p.name)]
+        if (path / CLIPS).is_dir():
+            kept = sorted((path / CLIPS).iterdir())
+            clips += [look(p) for p in kept if p.name.endswith((".mcap", ".mcap" + PART))]
     files = []
     for path in found:
         if progress is not None:
@@ -133,9 +145,14 @@ def verify(paths: Sequence[Path], progress: Callable[[Path], None] | None = None
             if not path.exists() or path in found:
                 notes.append(f"{path.name} went away meanwhile")
                 continue
-        files.append(_look(path))
-    verdict = Verdict(_in_order(files), notes=notes)
-    for f in verdict.files:
+        files.append((take or look)(path))
+    return judged(files, notes, clips)
+
+
+def judged(files: list[File], notes: list[str], clips: Sequence[File] = ()) -> Verdict:
+    """The verdict on files that have been looked at."""
+    verdict = Verdict(_in_order(files), notes=notes, clips=list(clips))
+    for f in verdict.clips + verdict.files:
         if f.damage:
             verdict.wanting.append(f"{f.path}: {f.damage}")
         if f.state == "repaired":
@@ -154,7 +171,8 @@ def _is_damaged(name: str) -> bool:
 # ------------------------------------------------------------------------------------------------------------ one file
 
 
-def _look(path: Path) -> File:
+def look(path: Path) -> File:
+    """Walk through a file; what is wrong with it is in the result."""
     f = File(path)
     try:
         with path.open("rb") as file:
@@ -170,10 +188,13 @@ def _look(path: Path) -> File:
                 f.state = "open"
         if REPAIRED_METADATA in metadata:
             f.state = "repaired"
-            lost = metadata[REPAIRED_METADATA].get("lost_bytes", "")
-            f.lost_bytes = int(lost) if lost.isdecimal() else 0
-        for stored in reader.read_messages(path):
-            _message(f, stored)
+            f.lost_bytes = reader.count(metadata[REPAIRED_METADATA].get("lost_bytes", ""))
+        tally = reader.Tally()
+        try:
+            for stored in reader.read_messages(path, _Telling(), tally):
+                _message(f, stored)
+        finally:
+            f.messages, f.begin_ns, f.end_ns = tally.messages, tally.begin_ns, tally.end_ns
     except OSError as e:
         f.state, f.damage = "unreadable", f"cannot be read: {e.strerror or e}"
     except ValueError as e:  # damaged
@@ -181,10 +202,20 @@ def _look(path: Path) -> File:
     return f
 
 
+class _Telling:
+    """The topics that tell what is there and why; the rest is only counted."""
+
+    def __contains__(self, topic: object) -> bool:
+        return str(topic).startswith(topics.RAW_PREFIX) or topic in ("/faults", "/events", "/rosout")
+
+
+def looks(paths: Sequence[Path]) -> Iterator[File]:
+    """`look` at one after the other."""
+    return map(look, paths)
+
+
 def _message(f: File, stored: reader.Stored) -> None:
-    f.begin_ns = min(f.begin_ns, stored.log_ns) if f.messages else stored.log_ns
-    f.end_ns = max(f.end_ns, stored.log_ns)
-    f.messages += 1
+    f.begin_ns = f.begin_ns or stored.log_ns  # until the walk has ended
     topic = stored.topic
     if topic == topics.CHECKPOINT_TOPIC:
         if f.order < 0:
@@ -386,7 +417,7 @@ def _within_run(a: File, b: File, at_disk: Sequence[tuple[int, int]]) -> list[Ga
 
 def _between_runs(a: File, b: File) -> Gap:
     begin, end = a.last_raw_ns, b.begin_ns
-    boots = a.run.get("boot", ""), b.run.get("boot", "")
+    boots = a.run.get("boot", "").replace("-", ""), b.run.get("boot", "").replace("-", "")
     if a.stopped:
         reason, text = "stop", "stopped in order"
     elif a.failed:
@@ -453,6 +484,9 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
             }
             for g in verdict.gaps
         ],
+        "clips": [
+            {"file": str(f.path), "bytes": f.size, "state": f.state, "messages": f.messages} for f in verdict.clips
+        ],
         "clock_steps": [{"utc": iso(t), "text": text} for f in files for t, text in f.steps],
         "files": [
             {
@@ -480,6 +514,11 @@ def as_text(verdict: Verdict) -> str:
         hours, rest = divmod(v["recorded_s"], 3600)
         lines[0] += f", {v['begin_utc'][:19]}Z to {v['end_utc'][:19]}Z, recorded {hours:.0f} h {rest / 60:.1f} min"
         lines.append("raw blocks: " + ", ".join(f"{port} {n}" for port, n in v["raw_blocks"].items()))
+    if v["clips"]:
+        whole = sum(c["state"] == "complete" for c in v["clips"])
+        lines.append(
+            f"clips: {len(v['clips'])}, {whole} of them whole, {sum(c['bytes'] for c in v['clips']) / 1e6:.1f} MB"
+        )
     for g in v["gaps"]:
         lines.append(f"gap {g['begin_utc'][:23]}Z {g['seconds']:.1f} s, {g['source']}: {g['reason']}: {g['text']}")
     lines += [f"clock {s['utc'][:23]}Z: {s['text']}" for s in v["clock_steps"]]

@@ -6,6 +6,7 @@ which begins with a checkpoint. What main needs to know of the disk is published
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import threading
@@ -25,6 +26,7 @@ from edge_agent.recording.segments import Recorder, RecordingError, list_segment
 MB = 1_000_000
 DERIVED_SHARE = 0.75  # of outbox and ring: derived records can be recomputed from raw ones, so they go first
 RETRY_NS = 5 * m.S  # a refusing disk is tried again after so long
+GONE_NS = 30 * m.S  # a folder that recordings were in is away so long: the process ends, to be started anew
 SPACE_NS = 5 * m.S  # how often the free space is asked for,
 FOLDER_NS = 60 * m.S  # and the folder read: thousands of names
 
@@ -67,6 +69,17 @@ class Disk:
     oldest_utc_ns: int = 0
 
 
+def _gone(folder: Path) -> bool:
+    """Whether it is not there; a disk that does not answer is sick, not gone."""
+    try:
+        folder.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:
+        pass
+    return False
+
+
 class Writer(threading.Thread):
     """Drives the Recorder; holds records in a ring while the disk refuses."""
 
@@ -103,6 +116,7 @@ class Writer(threading.Thread):
         self.ring_bytes = 0
         self._told = False  # of the disk's refusal
         self._retry_ns = 0
+        self._gone_ns = 0  # the folder was first seen missing
 
     def run(self) -> None:
         try:
@@ -119,7 +133,7 @@ class Writer(threading.Thread):
                     if now - begun > flush_s * m.S:
                         break  # a slow disk: flushing must not wait for all the rest
                 self.busy_ns = self._now()
-                self._due(time.monotonic_ns())
+                self._due(time.monotonic_ns(), begun)
                 self.busy_ns = 0
             self._end(time.monotonic_ns())
             self._close_books()
@@ -229,19 +243,33 @@ class Writer(threading.Thread):
             self.holding = self._told = False
             self.faults.append(m.Fault(now, "recorder", "DISK_OK", "recording goes on"))
 
-    def _due(self, now: int) -> None:
+    def _due(self, now: int, begun: int = 0) -> None:
+        """`begun`: when the first record in hand was taken; 0 = none was."""
         if self.holding:
             if self._ring and now >= self._retry_ns:
                 self._resume(now)
+            self._see_to_folder(now)
         else:
             try:
-                self.recorder.idle(now)
+                if self.recorder.idle(now, begun):
+                    self.recorder.fsync_took(self._now() - (begun or now))
             except RecordingError as e:
                 self._failed(e, now)
         self.open_file = self._rotates, self.recorder.open_bytes
         self.faults.extend(self.recorder.drain_faults())
         self._close_books()
         self._look(now)
+
+    def _see_to_folder(self, now: int) -> None:
+        """The folder of a service is a mount of its own: once it is deleted, only a new start of the service brings it
+        back. OSError where that is so."""
+        if self.recorder.segments == 0 or not _gone(self.recorder.data_dir):
+            self._gone_ns = 0
+        elif not self._gone_ns:
+            self._gone_ns = now
+        elif now - self._gone_ns >= GONE_NS:
+            text = "the folder was taken away and cannot be made again from here"
+            raise FileNotFoundError(errno.ENOENT, text, str(self.recorder.data_dir))
 
     @property
     def ring_items(self) -> int:

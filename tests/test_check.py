@@ -17,7 +17,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from live import parse
+from live import PATIENCE_S, parse
 
 from drivers import PortError
 from edge_agent import check, lock
@@ -32,16 +32,26 @@ from edge_agent.simulate.play import Slcan, Terminal, can_schedule, serial_sched
 SECONDS = 1.0
 
 
+BYTES, FRAMES = 2000, 100
+"""What comes of one port in one second of `steady_time`."""
+
+
 @pytest.fixture(autouse=True)
 def steady_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A port is listened to for a number of reads, not for a time: this machine may be busy."""
-    now = threading.local()
+    """A port is listened to until so much came, not for a time: this machine may be busy."""
+    end = time.monotonic() + PATIENCE_S
 
     def monotonic() -> float:
-        step = 0.5 if threading.current_thread().name == "check-clock" else 0.1
-        now.value = getattr(now, "value", 0.0) + step
-        return float(now.value)
+        assert time.monotonic() < end, "nothing comes any more"
+        listener = threading.current_thread()
+        assert isinstance(listener, check.Listener)
+        if listener.settings.kind == "clock":
+            reads[listener] = reads.get(listener, 0) + 1
+            return 0.5 * reads[listener]
+        payloads = [raw.payload for raw in listener.raws]
+        return sum(len(p) / BYTES if isinstance(p, bytes) else p.t_ns.size / FRAMES for p in payloads)
 
+    reads: dict[threading.Thread, int] = {}
     monkeypatch.setattr(check, "time", SimpleNamespace(monotonic=monotonic))
 
 
@@ -299,6 +309,12 @@ def test_a_flood_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 # -------------------------------------------------------------------------------------------------------------- today
 
 
+@pytest.fixture
+def large_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=20e9, total=32e9))
+
+
+@pytest.mark.usefixtures("large_disk")
 def test_what_is_not_there_today_is_a_note_and_no_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = PORTS.replace("DEVICE", "/dev/null").replace("URL", str(tmp_path / "ttyNONE"))
     text = text.replace("ports: {", "ports: {can: {kind: can, channel: nocan0}, ")
@@ -315,6 +331,7 @@ def test_what_is_not_there_today_is_a_note_and_no_mistake(tmp_path: Path, capsys
     ]
 
 
+@pytest.mark.usefixtures("large_disk")
 def test_two_names_of_one_device_are_told(tmp_path: Path) -> None:
     (tmp_path / "by-id").symlink_to("/dev/null")
     made = parse(PORTS.replace("DEVICE", "/dev/null").replace("URL", str(tmp_path / "by-id")), tmp_path)

@@ -45,7 +45,7 @@ from edge_agent.messages import (
 )
 from edge_agent.recording import topics
 from edge_agent.recording.clips import Clips
-from edge_agent.recording.segments import Recorder, RecordingError
+from edge_agent.recording.segments import BELIEVED_NS, Recorder, RecordingError
 from edge_agent.simulate.encode import nmea_epoch, sentence
 from edge_agent.triggers import Triggers
 
@@ -264,7 +264,8 @@ def retention(made: Config) -> Outputs:
             return 5_000_000 - sum(os.stat(Path(folder, f)).st_size for f in os.listdir(folder))
 
         recorder = Recorder(Path(folder), made.record, made.site, {}, {}, free)
-        recorder.handle(order(T))
+        recorder.handle(order(T), 0)
+        recorder.handle(order(T), BELIEVED_NS)  # the clock has run without a step for so long
         recorder.close()
         return {"files": sorted(os.listdir(folder))}
 
@@ -401,7 +402,9 @@ def serial_line(made: Config) -> Outputs:
         port.open()
         for k, (master, _) in enumerate(ends):
             os.write(master, b"receiver %d" % k)
-        ((_, data),) = port.read()
+        data = b""
+        while len(data) < 10:
+            data += b"".join(piece for _, piece in port.read())
         speeds = [termios.tcgetattr(slave)[4:6] for _, slave in ends]
     finally:
         port.close()
@@ -589,7 +592,9 @@ ROWS: dict[str, Row] = {
     "events.release": Row(events, "events.release=0.1", "events", MOVED),
     "events.clips_gb": Row(clip, "events.clips_gb=0.001", "files", PULLED),
     "events.hook": Row(clip, "events.hook=[/bin/false]", "told", PULLED),
-    "events.hook_s": Row(clip, "events.hook_s=0.05", "told", (*PULLED, "events.hook=[/bin/sh, -c, sleep 1]")),
+    "events.hook_s": Row(
+        clip, "events.hook_s=0.05", "told", (*PULLED, "events.hook=[/bin/sh, -c, sleep 1000]", "events.hook_s=0.1")
+    ),
     "record.accel_block": Row(path, "record.accel_block=false", "/accel/acc/block"),
 }
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 
+from live import PATIENCE_S
+
 from edge_agent.queues import ByteQueue
 
 
@@ -22,16 +24,18 @@ def test_bound_share_and_order() -> None:
 def test_take_wakes_for_enough_and_for_close() -> None:
     q: ByteQueue[int] = ByteQueue(100)
     got: list[list[int]] = []
-    reader = threading.Thread(target=lambda: got.append(list(q.take(30.0, wake_bytes=50))))
+    never = 1e6  # s: who is not woken is found waiting
+    reader = threading.Thread(target=lambda: got.append(list(q.take(never, wake_bytes=50))), daemon=True)
     reader.start()
     q.put(1, 10)
     q.put(2, 60)
-    reader.join(timeout=30)
+    reader.join(PATIENCE_S)
+    assert not reader.is_alive()
     assert [x for items in got for x in items] + list(q.take(0.0)) == [1, 2]
-    other = threading.Thread(target=lambda: got.append(list(q.take(30.0))))
+    other = threading.Thread(target=lambda: got.append(list(q.take(never))), daemon=True)
     other.start()
     q.close()
-    other.join(timeout=30)
+    other.join(PATIENCE_S)
     assert not other.is_alive()
     assert q.drained
 

@@ -14,6 +14,7 @@ from live import (
     CAN,
     CLOCK,
     GNSS,
+    PATIENCE_S,
     Live,
     decoded,
     faults,
@@ -393,12 +394,12 @@ def test_a_full_inbox_drops_the_newest_and_says_how_many(script: list[Raw], tmp_
 
         def slow(raw: Raw) -> list[Record]:
             entered.set()
-            assert gate.wait(60)
+            assert gate.wait(PATIENCE_S)
             return step(raw)
 
         live.agent.pipeline.step = slow  # type: ignore[method-assign]
         live.play(script[100:101])
-        assert entered.wait(60)
+        assert entered.wait(PATIENCE_S)
         live.play(script[101:300])  # nobody takes them
         # what main has in its hand counts until it is done
         room = 20_000 - reading.payload_size(script[100].payload) - reading.RECORD_OVERHEAD
@@ -437,7 +438,7 @@ class Gated(Recorder):
 
     def handle(self, item: Record | Rotate, now_ns: int | None = None) -> None:
         self.waiting.set()
-        assert self.gate.wait(60)
+        assert self.gate.wait(PATIENCE_S)
         super().handle(item, now_ns)
 
 
@@ -455,7 +456,7 @@ def test_a_full_outbox_refuses_derived_records_first_and_verify_knows(script: li
         Gated.gate.clear()
         Gated.waiting.clear()
         live.play(script[begin : begin + 2])
-        assert Gated.waiting.wait(60)
+        assert Gated.waiting.wait(PATIENCE_S)
         first = None
         for i in range(begin + 2, len(script)):
             live.play(script[i : i + 1], step=True)

@@ -114,10 +114,18 @@ class Site:
             return 0.0
         return (max(t) - min(t)) / S if t else 0.0
 
-    def amid_a_file(self) -> bool:
-        """Three seconds of data are on the disk, and no rotation is near."""
-        files = recordings(self.rec) if self.rec.exists() else []
-        return bool(files) and 0.2 < self.seconds(files[-1:]) < 1.2 and self.seconds(files) >= 3.0
+    def caught_amid_a_file(self, agent: subprocess.Popen[bytes]) -> bool:
+        """Stop the agent where it stands: some of its files are finished and one is open that holds data. If not,
+        it goes on. A look without the stop would be of a file that is finished before the kill comes."""
+        if not self.rec.exists() or len(recordings(self.rec)) < 3:
+            return False
+        agent.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, agent.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+        files = recordings(self.rec)
+        if [f.suffix for f in files].count(".part") == 1 and self.seconds(files[-1:]) > 0.2:
+            return True
+        agent.send_signal(signal.SIGCONT)
+        return False
 
     def log(self) -> str:
         return (self.folder / "agent.log").read_text(errors="replace")
@@ -131,7 +139,7 @@ def test_sigkill_under_load_then_recover_and_the_next_run_in_the_same_folder(tmp
     site = Site(tmp_path)
     try:
         with site.run(1) as agent:
-            until(lambda: site.amid_a_file() or agent.poll() is not None, "3 s of data on the disk", 0.1)
+            until(lambda: site.caught_amid_a_file(agent) or agent.poll() is not None, "an open file with data", 0.1)
             assert agent.poll() is None, site.log()
             agent.send_signal(signal.SIGKILL)
             agent.wait(PATIENCE_S)
@@ -187,7 +195,8 @@ def test_sigkill_under_load_then_recover_and_the_next_run_in_the_same_folder(tmp
     assert report.raws == len(raws(files)) - waited
     verdict = verify([site.rec])
     assert verdict.wanting == []
-    assert [g.reason for g in verdict.gaps if g.source == "all"] == ["kill"]
+    # that the machine stood still for a while besides is its affair
+    assert [g.reason for g in verdict.gaps if g.source == "all" and g.reason != "stall"] == ["kill"]
 
 
 def test_a_run_killed_at_its_first_checkpoint_is_not_taken_for_the_beginning_of_the_next(
@@ -240,15 +249,30 @@ class Plug:
             data = data[os.write(self.master, data) :]
 
 
+class Watch:
+    """The clock of a serial port that stands where the test sets it: on the script's time, as the other ports are."""
+
+    ns = START_NS
+
+    def monotonic_ns(self) -> int:
+        return self.ns
+
+    def sleep(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
+    """Quick ports, and their clock."""
     monkeypatch.setattr(drivers.serial_port, "COALESCE_S", 0.001)
     monkeypatch.setattr(drivers.serial_port, "WAIT_S", 0.02)
     monkeypatch.setattr(reading, "BACKOFF_S", (0.02, 0.04))
+    made = Watch()
+    monkeypatch.setattr(drivers.serial_port, "time", made)
+    return made
 
 
-@pytest.mark.usefixtures("quick")
-def test_a_pulled_plug_is_a_fault_and_the_rest_goes_on(script: list[Raw], tmp_path: Path) -> None:
+def test_a_pulled_plug_is_a_fault_and_the_rest_goes_on(script: list[Raw], tmp_path: Path, watch: Watch) -> None:
     plug = Plug(tmp_path / "receiver")
     serial = SerialPort(PortSettings(GNSS, "serial", str(plug.link)))
     sent = [b"", b""]
@@ -260,6 +284,7 @@ def test_a_pulled_plug_is_a_fault_and_the_rest_goes_on(script: list[Raw], tmp_pa
                 if raw.source == GNSS:
                     assert isinstance(raw.payload, bytes)
                     if half >= 0:
+                        watch.ns = raw.t_ns
                         plug.send(raw.payload)
                         sent[half] += raw.payload
                         until(lambda: account.bytes == len(sent[0] + sent[1]), "every byte is read")
@@ -291,8 +316,7 @@ def test_a_pulled_plug_is_a_fault_and_the_rest_goes_on(script: list[Raw], tmp_pa
     assert report.compared == report.derived > 100
 
 
-@pytest.mark.usefixtures("quick")
-def test_garbage_on_the_wire_is_said_and_then_forgiven(script: list[Raw], tmp_path: Path) -> None:
+def test_garbage_on_the_wire_is_said_and_then_forgiven(script: list[Raw], tmp_path: Path, watch: Watch) -> None:
     plug = Plug(tmp_path / "receiver")
     serial = SerialPort(PortSettings(GNSS, "serial", str(plug.link)))
     noise = bytes(np.random.default_rng(3).integers(0, 256, 4000, np.uint8)).replace(b"$", b"")
@@ -305,6 +329,7 @@ def test_garbage_on_the_wire_is_said_and_then_forgiven(script: list[Raw], tmp_pa
         for i, tick in enumerate(ticks[1:20]):
             data = noise[i * 200 : i * 200 + 200] if i < 10 else b"".join(good[10 * i : 10 * i + 10])
             size += len(data)
+            watch.ns = tick.t_ns - S // 10
             plug.send(data)
             until(lambda size=size: live.agent.accounts[GNSS].bytes == size, "every byte is read")  # type: ignore[misc]
             live.play([tick], step=True)
@@ -367,7 +392,7 @@ def test_a_full_disk_is_waited_for_in_memory(
         flushed(live)
         disk.full = True
         live.play(script[300:310], step=True)
-        until(lambda: live.agent.writer.holding, "the writer has noticed")
+        until(lambda: live.agent.writer._told, "the writer has noticed")
         live.play(script[310:500], step=True)
         live.settle()
         until(lambda: disk.refused > 5, "it is tried again")
@@ -454,7 +479,7 @@ def test_a_disk_that_is_full_to_the_end_is_told_on_stderr(script: list[Raw], tmp
         flushed(live)
         disk.full = True
         live.play(script[100:200], step=True)
-        until(lambda: live.agent.writer.holding, "the writer has noticed")
+        until(lambda: live.agent.writer._told, "the writer has noticed")
     assert any("DISK_FULL" in line for line in live.said)
     files = recordings(tmp_path / "rec")
     gone = [r for r in script[:200] if r.order not in {x.order for x in raws(files)}]

@@ -12,6 +12,7 @@ import time
 
 import numpy as np
 import pytest
+from live import PATIENCE_S, until
 from oracles import accel_q, dense_smoother, riccati_bound, smoothed_bound
 
 from edge_agent.messages import CanFrames, GnssFix, S, Tick
@@ -491,7 +492,7 @@ def test_terminals_play_to_a_reader_and_to_nobody():
         assert not termios.tcgetattr(gnss)[3] & (termios.ECHO | termios.ICANON)  # raw: no echo, no line editing
         assert not adapter.ready  # the channel is closed
         os.write(can, b"C\rS6\rO\r")
-        adapter.serve()
+        until(lambda: adapter.serve() or adapter.ready, "an open channel")  # what was written comes through in time
         assert read_all(can, 3) == b"\a\r\r"
         assert adapter.ready
         serial = [(i * 1000, bytes([i % 256, 13, 10, 3, 4, 17, 19, 26])) for i in range(2000)]  # control codes too
@@ -548,7 +549,7 @@ def test_python_can_reads_the_adapter():
     thread.start()
     try:
         with can.Bus(interface="slcan", channel=adapter.path, bitrate=500_000, sleep_after_open=0.0) as bus:
-            got = [bus.recv(10.0) for _ in range(len(frames.t_ns))]
+            got = [bus.recv(PATIENCE_S) for _ in range(len(frames.t_ns))]
     finally:
         ended.set()
         thread.join()

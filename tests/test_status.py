@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from live import CAN, CLOCK, GNSS, Live, faults, ports, recordings, settings, until
+from live import CAN, CLOCK, GNSS, PATIENCE_S, Live, faults, ports, recordings, settings, until
 
 from edge_agent import __main__ as cli
 from edge_agent import observe, watch
@@ -345,6 +345,10 @@ def test_what_is_no_status_is_said_and_not_guessed() -> None:
                 st.from_json(json.dumps(broken))
             seen += 1
     assert seen > 300
+    whole["points"][0]["std_velocity_mps"].append(0.1)
+    with pytest.raises(st.StatusError, match=r"damaged status of edge-agent: the axes of point '\w+' are not complete"):
+        st.from_json(json.dumps(whole))
+    whole["points"][0]["std_velocity_mps"].pop()
     del whole["disk"]["files"]
     with pytest.raises(st.StatusError, match="damaged status of edge-agent: disk is not"):
         st.from_json(json.dumps(whole))
@@ -654,20 +658,19 @@ def test_a_folder_that_hangs_holds_up_nobody(
 
     def stuck(path: Path, text: str) -> None:
         waiting.set()
-        assert gate.wait(60)
+        assert gate.wait(PATIENCE_S)
         real(path, text)
 
     monkeypatch.setattr(observe, "replace", stuck)
     with Live(settings(tmp_path), ports(), status_dir=tmp_path / "run") as live:
         live.play(script[:30])
-        assert waiting.wait(60)
+        assert waiting.wait(PATIENCE_S)
         live.play(script[30:200])
         live.settle()
         publisher = live.agent.publisher
         assert publisher is not None
         assert publisher.written == 0
         gate.set()
-    publisher.join(60)  # the agent itself waits for 2 s only
     assert st.load([tmp_path / "run"])[1].state == "stopped"
     assert live.balance() == {}
 

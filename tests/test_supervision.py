@@ -14,6 +14,7 @@ from live import (
     CAN,
     CLOCK,
     GNSS,
+    PATIENCE_S,
     Live,
     ScriptedPort,
     faults,
@@ -26,9 +27,10 @@ from live import (
     until,
     values,
 )
+from stepped import Stepped
 
 from drivers import PortError
-from edge_agent import reading, runtime
+from edge_agent import reading, runtime, writing
 from edge_agent.messages import MS, Raw, Record, Rotate, S
 from edge_agent.queues import ByteQueue
 from edge_agent.reading import PortWatch, payload_size
@@ -73,7 +75,7 @@ class Gated(Recorder):
     def handle(self, item: Record | Rotate, now_ns: int | None = None) -> None:
         if not self.gate.is_set():
             self.waiting.set()
-        assert self.gate.wait(60)
+        assert self.gate.wait(PATIENCE_S)
         super().handle(item, now_ns)
 
 
@@ -100,7 +102,7 @@ def test_a_writer_that_hangs_is_a_fault_after_5_s_with_its_end(
         live.settle()
         gated.gate.clear()
         live.play([tick_of(3)], step=True)
-        assert gated.waiting.wait(60)
+        assert gated.waiting.wait(PATIENCE_S)
         time.ns += 5 * S
         live.play([tick_of(4)], step=True)
         assert not any("WRITER_STALLED" in line for line in live.said)
@@ -203,20 +205,27 @@ def test_a_block_that_the_writer_forgets_is_a_fault(script: list[Raw], tmp_path:
     assert (fault["source"], values(fault)["missing"]) == (GNSS, 1)
 
 
-def test_a_held_block_that_vanishes_from_the_ring_is_a_fault(tmp_path: Path, script: list[Raw]) -> None:
+def test_a_held_block_that_vanishes_from_the_ring_is_a_fault(
+    tmp_path: Path, script: list[Raw], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writing, "RETRY_NS", 1 << 62)  # the ring stays what it is
     with Live(settings(tmp_path), ports(), free_bytes=lambda: 0) as live:  # no file can be begun
         live.play(script[:60], step=True)
         live.settle()
         until(lambda: live.agent.writer.books[CAN].ring > 5, "blocks in the ring")
         live.play([tick_of(9)], step=True)
         assert not any("LEDGER" in line for line in live.said)
-        ring = live.agent.writer._ring
-        live.settle()
-        ring.remove(next(r for r in ring if isinstance(r, Record) and r.topic == f"/raw/{CAN}"))
-        live.play([tick_of(10)], step=True)
-        live.settle()
-        before = live.agent.writer.books
-        until(lambda: live.agent.writer.books is not before, "closed books")
+        writer = live.agent.writer
+        close, held = writer._close_books, writer.books[CAN].ring
+
+        def careless() -> None:
+            ring = writer._ring
+            ring.remove(next(r for r in ring if isinstance(r, Record) and r.topic == f"/raw/{CAN}"))
+            writer._close_books = close  # type: ignore[method-assign]
+            close()
+
+        writer._close_books = careless  # type: ignore[method-assign]
+        until(lambda: writer.books[CAN].ring < held, "closed books")
         live.play([tick_of(11)], step=True)
         assert sum("LEDGER: 1 blocks" in line for line in live.said) == 1
 
@@ -267,7 +276,7 @@ def test_a_silent_bus_is_opened_again_and_a_working_port_is_left_alone(script: l
     fixes = [r for r in script if r.source == GNSS]
     with Live(settings(tmp_path), made) as live:
         live.play([tick_of(0)], step=True)
-        until(lambda: made[CAN].counters["opens"] == 1, "the bus is open")
+        until(lambda: live.agent.readers[CAN].state == "OPEN", "the bus is open")
         for second in range(1, 60):
             live.play([fixes[second], tick_of(second)], step=True)
             if second in (16, 36):
@@ -294,7 +303,7 @@ class Stuck(ScriptedPort):
 
     def read(self) -> list[tuple[int, Any]]:
         self.entered.set()
-        assert self.free.wait(60)
+        assert self.free.wait(PATIENCE_S)
         return []
 
 
@@ -309,7 +318,7 @@ def test_a_reader_that_hangs_is_replaced_alone(script: list[Raw], tmp_path: Path
 
     with Live(settings(tmp_path), {**made, CAN: stuck}, now=time, make_port=make_port) as live:
         live.play([tick_of(0)], step=True)
-        assert stuck.entered.wait(60)
+        assert stuck.entered.wait(PATIENCE_S)
         old = live.agent.readers[CAN]
         pass_by(live, time, 30, GNSS)
         live.play([tick_of(1)], step=True)
@@ -322,7 +331,7 @@ def test_a_reader_that_hangs_is_replaced_alone(script: list[Raw], tmp_path: Path
         live.play([tick_of(3)], step=True)
         assert asked == [CAN]
         stuck.free.set()
-        old.join(60)
+        old.join(PATIENCE_S)
         assert not old.is_alive()
         assert stuck.counters["closes"] == 1
         live.play([r for r in script if r.source == CAN][5:10], step=True)
@@ -363,7 +372,7 @@ def test_a_stop_waits_for_hung_readers_together_not_for_one_after_the_other(
     with Live(settings(tmp_path), {**ports(), **stuck}) as live:
         live.play([tick_of(0)], step=True)
         for port in stuck.values():
-            assert port.entered.wait(60)
+            assert port.entered.wait(PATIENCE_S)
         monkeypatch.setattr(reading.Reader, "join", join)
         real = runtime.time
         frozen = SimpleNamespace(monotonic=lambda: clock.ns / S, monotonic_ns=real.monotonic_ns, time_ns=real.time_ns)
@@ -384,7 +393,7 @@ def test_no_more_than_three_readers_of_a_port_hang(tmp_path: Path) -> None:
     with Live(settings(tmp_path), {**ports(), CAN: all_stuck[0]}, now=time, make_port=make_port) as live:
         live.play([tick_of(0)], step=True)
         for second in range(1, 10):
-            assert all_stuck[-1].entered.wait(60)
+            assert all_stuck[-1].entered.wait(PATIENCE_S)
             pass_by(live, time, 31, GNSS)
             live.play([tick_of(second)], step=True)
         assert len(all_stuck) == 1 + reading.HUNG_MOST
@@ -402,15 +411,15 @@ def test_the_status_of_a_stalled_disk_and_a_hung_port_says_so(
     made: dict[str, Any] = {**ports(), CAN: stuck}
     with Live(settings(tmp_path), made, make_recorder=gated, now=time, status_dir=run) as live:
         live.play([r for r in script[:60] if r.source != CAN], step=True)
-        assert stuck.entered.wait(60)
+        assert stuck.entered.wait(PATIENCE_S)
         live.settle()
         gated.gate.clear()
         live.play([tick_of(3)], step=True)
-        assert gated.waiting.wait(60)
+        assert gated.waiting.wait(PATIENCE_S)
         pass_by(live, time, 31, GNSS)
         live.play([tick_of(4)], step=True)
         at = EPOCH_UTC_NS + 4 * S
-        until(lambda: st.load([run])[1].written_utc_ns == at, "the status of a stalled disk")
+        until(lambda: (run / st.NAME).exists() and st.load([run])[1].written_utc_ns == at, "that status")
         s = st.load([run])[1]
         assert (s.disk.state, s.disk.stalled_s, s.disk.stalls) == ("stalled", 31.0, 1)
         assert [p.state for p in s.ports] == ["OK", "HUNG"]
@@ -419,3 +428,70 @@ def test_the_status_of_a_stalled_disk_and_a_hung_port_says_so(
         assert "! port can HUNG for" in text
         gated.gate.set()
         stuck.free.set()
+
+
+def test_a_reader_that_was_replaced_lets_go_of_its_device_without_a_word(tmp_path: Path) -> None:
+    said: list[bool] = []
+
+    class Port(ScriptedPort):
+        def close(self, silently: bool = False) -> None:
+            said.append(silently)
+
+    for abandoned in (False, True):
+        port, stop = Port(), threading.Event()
+        reader = reading.Reader(CAN, port, ByteQueue(1000), reading.Account(), stop)
+
+        def last(reader: reading.Reader = reader, stop: threading.Event = stop, gone: bool = abandoned) -> list[Any]:
+            reader.abandoned = gone
+            stop.set()
+            return []
+
+        port.read = last  # type: ignore[method-assign]
+        reader.run()
+    assert said == [False, True]
+
+
+def test_frames_that_the_kernel_drops_are_told_once_a_second_and_the_journal_once_a_minute(
+    script: list[Raw], tmp_path: Path
+) -> None:
+    """GIVEN a kernel that drops three frames of each block for ten minutes THEN the recording counts each second,
+    stderr has a first line, one a minute and the rest at the end, and both sums are right."""
+    run = Stepped(settings(tmp_path))
+    blocks = [r for r in script if r.source == CAN][:2]
+    for second in range(600):
+        run.play([tick_of(second)])
+        for i, r in enumerate(blocks):
+            t_ns = START_NS + second * S + (i + 1) * 300 * MS
+            payload = replace(r.payload, dropped=3 if second < 590 else 0, t_ns=r.payload.t_ns - r.t_ns + t_ns)  # type: ignore[union-attr,call-arg]
+            run.play([Raw(t_ns, 0, CAN, payload)])
+    run.close()
+    files = run.files()
+    lost = faults(files, "LOSS")
+    assert {(f["source"], values(f)["count"]) for f in lost} == {(CAN, 6.0)}
+    assert len(lost) == 590
+    assert all("lost at kernel" in f["text"] for f in lost)
+    lines = [line for line in run.said if "LOSS" in line]
+    assert lines[0] == "can: LOSS: 6 lost at kernel"
+    assert lines[2] == "can: LOSS: 360 more lost at kernel within 60 s"
+    assert len(lines) == 11
+    counts = [int(line.split(": ")[2].split()[0]) for line in lines]
+    assert sum(counts) == 590 * 6 == run.agent._kernel[CAN]
+    assert {int(d["dropped_kernel"]) for d in [ledgers(files)[CAN]]} == {590 * 6}
+
+
+def test_what_is_said_of_losses() -> None:
+    said: list[str] = []
+    losses = runtime.Losses(said.append)
+    losses.tell("inbox", "gnss", 2, 0)
+    losses.tell("inbox", "gnss", 3, S)
+    losses.tell("outbox", "/raw/can", 1, S)
+    losses.every_second(59 * S)
+    assert said == ["gnss: LOSS: 2 lost at inbox", "/raw/can: LOSS: 1 lost at outbox"]
+    losses.every_second(60 * S)
+    assert said[2:] == ["gnss: LOSS: 3 more lost at inbox within 60 s"]
+    losses.every_second(120 * S)  # nothing more in this minute: the next is a first one again
+    losses.tell("inbox", "gnss", 4, 121 * S)
+    losses.tell("inbox", "gnss", 5, 122 * S)
+    losses.close()
+    losses.close()
+    assert said[3:] == ["gnss: LOSS: 4 lost at inbox", "gnss: LOSS: 5 more lost at inbox"]

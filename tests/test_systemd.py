@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import yaml
 
-from edge_agent import config
+from edge_agent import config, runtime
 from edge_agent.config import keys_of, load, parse
 from edge_agent.messages import (
     AccelerometerSettings,
@@ -112,6 +112,15 @@ def test_the_unit_keeps_what_was_promised() -> None:
     ):
         assert line in lines, line
     assert not [x for x in lines if "AF_INET" in x]
+
+
+def test_the_unit_says_which_boot_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ProcSubset=pid hides boot_id from the agent, and without it a power cut looks like a kill."""
+    assert f"Environment={runtime.BOOT_VARIABLE}=%b" in UNIT.read_text().splitlines()
+    monkeypatch.setenv(runtime.BOOT_VARIABLE, "4f2a")
+    assert runtime.boot_id() == "4f2a"
+    monkeypatch.delenv(runtime.BOOT_VARIABLE)
+    assert runtime.boot_id() != "4f2a"
 
 
 # ------------------------------------------------------------------------------------------------------------- example

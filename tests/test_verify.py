@@ -15,6 +15,7 @@ from edge_agent.__main__ import main
 from edge_agent.messages import Raw, Record, RecordSettings, Rotate, S, Tick
 from edge_agent.recording import reader, topics
 from edge_agent.recording.segments import Recorder, recover
+from edge_agent.recording.writer import SegmentWriter
 from edge_agent.verify import Verdict, as_json, as_text, verify
 
 T = 1_780_300_800 * S  # 2026-06-01 08:00:00 UTC
@@ -365,3 +366,45 @@ def test_damage_in_one_file_does_not_hide_the_others(tmp_path: Path, capsys: pyt
     assert [f["damage"] for f in listed if f["file"].endswith("none.mcap")] == [
         "cannot be read: No such file or directory"
     ]
+
+
+def test_clips_are_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = three(tmp_path)
+    clips = tmp_path / "clips"
+    clips.mkdir()
+    good = clips / "site_20260601T080010Z_000.mcap"
+    good.write_bytes(files[0].read_bytes())
+    found, said = code(tmp_path, capsys)
+    assert found == 0
+    assert said["clips"] == [
+        {"file": str(good), "bytes": good.stat().st_size, "state": "complete", "messages": said["files"][0]["messages"]}
+    ]
+    assert "clips: 1, 1 of them whole" in as_text(verify([tmp_path]))
+    assert [f["file"] for f in said["files"]] == [str(f) for f in files]  # the chain and the gaps know nothing of them
+    torn = clips / "site_20260601T080020Z_000.mcap.part"
+    torn.write_bytes(files[1].read_bytes()[:-300])
+    data = bytearray(files[2].read_bytes())
+    data[len(data) // 3] ^= 1
+    bad = clips / "site_20260601T080030Z_000.mcap"
+    bad.write_bytes(data)
+    found, said = code(tmp_path, capsys)
+    assert found == 1
+    assert [c["state"] for c in said["clips"]] == ["complete", "open", "damaged"]
+    (wanting,) = said["wanting"]
+    assert wanting.startswith(str(bad))
+    assert any(torn.name in note for note in said["notes"])
+
+
+@pytest.mark.parametrize("number", ["9" * 5000, "-1", "1e3", "", "\u0663"])
+def test_a_number_of_a_file_that_is_none_is_no_crash(tmp_path: Path, number: str) -> None:
+    """Also one that Python refuses to read because it is too long."""
+    writer = SegmentWriter(
+        tmp_path / "site_20260601T080000Z_000.mcap.part", metadata={"run": "r", "segment": number}, attachments={}
+    )
+    data = topics.checkpoint(0, 0, T, b"", "start")
+    writer.add(Record(topics.CHECKPOINT_TOPIC, T, T, data, False))
+    writer.close()
+    verdict = verify([tmp_path])
+    assert verdict.wanting == []
+    assert verdict.files[0].segment == (3 if number == "\u0663" else 0)
+    assert main(["info", *map(str, tmp_path.iterdir())]) == 0

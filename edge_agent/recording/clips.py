@@ -9,8 +9,12 @@ checkpoint ties to its UTC, so a clock that steps meanwhile does no harm.
 A clip's metadata names its triggers and the segments that it was taken from. Those replay byte for byte; a clip begins
 amid a segment, without a checkpoint, so `replay` computes it anew from its raw data.
 
+A run that ended without an orderly stop (a kill, a power cut) may have left events without their clip. The next start
+finds them in the last files before it, as the dead run's own Watch would have, and makes up for them.
+
 Retention never deletes clips; beyond `clips_gb` new ones are refused, and a fault says so (the segments still hold the
-data). The hook is run without a shell, in a process group of its own that is killed after `hook_s`.
+data). The hook is run without a shell, in a process group of its own that is killed after `hook_s`; it holds none of
+the agent's files, gives way to the agent where the processor is short, and is the first to go where memory is.
 """
 
 from __future__ import annotations
@@ -22,22 +26,40 @@ import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from edge_agent.messages import EventSettings, Fault, Record, S, TriggerSettings
 from edge_agent.recording import topics
-from edge_agent.recording.reader import DamagedError, Stored, newest_ns, read_between, read_messages
-from edge_agent.recording.segments import Recorder
-from edge_agent.recording.writer import PART, TIME_MAX, SegmentWriter
+from edge_agent.recording.reader import (
+    Stored,
+    head_metadata,
+    newest_ns,
+    read_attachments,
+    read_between,
+    read_messages,
+    read_metadata,
+)
+from edge_agent.recording.repair import REPAIRED_METADATA
+from edge_agent.recording.segments import Recorder, list_segments
+from edge_agent.recording.writer import PART, RUN_METADATA, TIME_MAX, SegmentWriter
 from edge_agent.triggers import BEGIN, END
 
 FOLDER = "clips"
+RUNS_BACK, FILES_BACK = 3, 64
+"""Runs and files before this one that are looked at for events without a clip: a power that comes and goes makes short
+runs."""
 JOBS = 16
 """Clips that wait to be written; one more is refused and told."""
+HOOK_NICE = 10
+HOOK_OOM = 500
+"""Score by which the kernel chooses whom to kill for memory; the service's own is -500."""
+OF_A_SEGMENT = ("segment", "opened_because", "previous_name", "previous_sha256")
+"""What a file's metadata say of its place among the others, which a clip has not."""
 PATIENCE_S = 30.0
 """How long a clip waits for its last records to reach the disk."""
 
@@ -49,6 +71,7 @@ class Job:
     begin_ns: int
     end_ns: int
     names: tuple[str, ...]
+    files: tuple[Path, ...] = ()  # of an earlier run that hold it; () = this run's
 
 
 class Watch:
@@ -132,11 +155,7 @@ class Clips(threading.Thread):
 
     def saw(self, record: Record, offset_ns: int) -> None:
         """A record on /events; `offset_ns` = UTC - monotonic of the open segment."""
-        event = topics.decode(topics.EVENT, record.data)
-        if event["kind"] == BEGIN:
-            self._watch.begin(event["source"], event["monotonic_ns"])
-        elif event["kind"] == END:
-            self._watch.end(event["source"], event["end"]["sec"] * S + event["end"]["nanosec"] - offset_ns)
+        take(self._watch, topics.decode(topics.EVENT, record.data), offset_ns)
 
     def fault(self, kind: str, t_ns: int) -> None:
         """A fault of that kind, monotonic."""
@@ -163,20 +182,34 @@ class Clips(threading.Thread):
 
     def run(self) -> None:
         try:
+            for left in self._left():
+                self._one(left)
             while (job := self._jobs.get()) is not None:
                 self._one(job)
         except BaseException as e:  # noqa: BLE001 - main raises it and ends the process
             self.failure = e
 
+    def _left(self) -> list[Job]:
+        """Intervals of earlier runs that have no clip."""
+        run = self.recorder.metadata.get("run", "")
+        try:
+            return [*left_over(self.recorder.data_dir, self.recorder.site, self.settings, self._of_fault, run)]
+        except FileNotFoundError:  # no folder yet
+            return []
+        except (OSError, ValueError, OverflowError) as e:
+            self._tell("CLIP_FAILED", f"what was before the start cannot be read: {e}")
+            return []
+
     def _one(self, job: Job) -> None:
-        self._wait_for(job)
+        if not job.files:
+            self._wait_for(job)
         try:
             made = self._write(job)
             if made is None:
                 return
             path, seconds = made
             size = path.stat().st_size
-        except (OSError, DamagedError) as e:
+        except (OSError, ValueError, OverflowError) as e:
             self._tell("CLIP_FAILED", f"{', '.join(job.names)}: {e}; the segments hold the data")
             return
         values = (("seconds", seconds), ("bytes", float(size)))
@@ -194,7 +227,7 @@ class Clips(threading.Thread):
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end and not self.stopping.is_set():
             newest = next(_sources(self.recorder.recent, job.end_ns, TIME_MAX), None)
-            with suppress(OSError, DamagedError):  # it has just been renamed: the next look finds it
+            with suppress(OSError, ValueError, OverflowError):  # it has just been renamed: the next look finds it
                 if newest is not None and newest_ns(newest[0]) - newest[1] >= job.end_ns:
                     return
             self.stopping.wait(self.recorder.settings.flush_s)
@@ -202,7 +235,7 @@ class Clips(threading.Thread):
     def _write(self, job: Job) -> tuple[Path, float] | None:
         """The clip and how many seconds are in it: fewer than asked for where the agent began later, or the disk has
         not got all of it."""
-        sources = [*_sources(self.recorder.recent, job.begin_ns, job.end_ns)][::-1]
+        sources = [*_sources(job.files or self.recorder.recent, job.begin_ns, job.end_ns)][::-1]
         if not sources:
             self._tell("CLIP_FAILED", f"{', '.join(job.names)}: no segment holds it")
             return None
@@ -213,14 +246,19 @@ class Clips(threading.Thread):
             self._tell("CLIPS_FULL", f"{', '.join(job.names)}: no clip was written, {text}")
             return None
         utc_ns = max(0, job.begin_ns + sources[0][1])
+        run, attachments = self.recorder.metadata, self.recorder.attachments
+        if job.files:
+            told = read_metadata(sources[-1][0]).get(RUN_METADATA, {})
+            run = {k: v for k, v in told.items() if k not in OF_A_SEGMENT}
+            attachments = {a.name: a.data for a in read_attachments(sources[-1][0])}
         metadata = {
-            **self.recorder.metadata,
+            **run,
             "site": self.recorder.site,
             "clip": ", ".join(job.names),
             "clip_of": ", ".join(path.name.removesuffix(PART) for path, _ in sources),
         }
         part = self._free_name(utc_ns)
-        writer = SegmentWriter(part, metadata=metadata, attachments=self.recorder.attachments, utc_ns=utc_ns)
+        writer = SegmentWriter(part, metadata=metadata, attachments=attachments, utc_ns=utc_ns)
         first, last = job.end_ns, job.begin_ns
         try:
             for path, offset in sources:
@@ -228,14 +266,14 @@ class Clips(threading.Thread):
                     writer.add(Record(s.topic, s.log_ns, s.publish_ns, s.data, False, s.schema))
                     first, last = min(first, s.log_ns - offset), max(last, s.log_ns - offset)
             return writer.close(), max(0, last - first) / S
-        except (OSError, DamagedError):
+        except (OSError, ValueError, OverflowError):
             writer.abandon()
             with suppress(OSError):
                 part.unlink()  # a copy of what the segments hold
             raise
 
     def _free_name(self, utc_ns: int) -> Path:
-        stem = f"{self.recorder.site}_{datetime.fromtimestamp(utc_ns // S, UTC):%Y%m%dT%H%M%SZ}"
+        stem = _stem(self.recorder.site, utc_ns)
         taken = [path.name for path in self.folder.iterdir()]
         number = 0
         while any(name.startswith(f"{stem}_{number:03d}.mcap") for name in taken):
@@ -248,11 +286,19 @@ class Clips(threading.Thread):
         """Run the hook with the clip's path behind its arguments; what went wrong, "" if nothing did."""
         argv = [*(self.settings.hook or ()), str(path)]
         environment = {**os.environ, "EDGE_AGENT_TRIGGERS": " ".join(job.names)}
-        environment.pop("NOTIFY_SOCKET", None)  # the hook does not speak for the service
+        for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"):  # the hook does not speak for the service
+            environment.pop(name, None)
         try:
-            process = subprocess.Popen(argv, stdin=subprocess.DEVNULL, env=environment, start_new_session=True)
+            process = subprocess.Popen(
+                argv, stdin=subprocess.DEVNULL, env=environment, start_new_session=True, close_fds=True
+            )
         except (OSError, ValueError) as e:  # a NUL in an argument
             return str(getattr(e, "strerror", None) or e)
+        with suppress(OSError):  # not what keeps the service alive when memory or time are short
+            nice = max(HOOK_NICE, os.getpriority(os.PRIO_PROCESS, process.pid))
+            os.setpriority(os.PRIO_PROCESS, process.pid, nice)
+        with suppress(OSError):
+            Path(f"/proc/{process.pid}/oom_score_adj").write_text(str(HOOK_OOM))
         end = time.monotonic() + self.settings.hook_s
         while process.poll() is None and time.monotonic() < end and not self.stopping.is_set():
             self.stopping.wait(0.05)
@@ -262,6 +308,97 @@ class Clips(threading.Thread):
             process.wait()
             return f"killed: it took longer than {self.settings.hook_s:g} s" if not self.stopping.is_set() else ""
         return f"exit code {process.returncode}" if process.returncode else ""
+
+
+def _stem(site: str, utc_ns: int) -> str:
+    return f"{site}_{datetime.fromtimestamp(utc_ns // S, UTC):%Y%m%dT%H%M%SZ}"
+
+
+def left_over(
+    data_dir: Path, site: str, settings: EventSettings, of_fault: Mapping[str, Sequence[str]], run: str
+) -> Iterator[Job]:
+    """Intervals in the last files of runs before `run` for which there should be a clip and is none. Only a run whose
+    last file was torn can have left any, and only of its last minutes: a clip is written as soon as nothing can be
+    added to it. OSError, ValueError for a file that another version wrote or that is damaged."""
+    lookback = int(2 * (settings.before_s + settings.max_s + settings.after_s + PATIENCE_S) * S)
+    runs: dict[str, list[Path]] = {}
+    oldest: dict[str, int] = {}  # run -> UTC before which nothing of it is looked at
+    for segment in reversed(list_segments(data_dir, site)[-FILES_BACK:]):
+        if segment.path.suffix != ".mcap":
+            continue
+        try:
+            name = head_metadata(segment.path, RUN_METADATA).get("run", "")
+            end_ns = newest_ns(segment.path)
+        except (OSError, ValueError, OverflowError):  # retention was quicker; the others may hold something
+            continue
+        if name == run or (len(runs) == RUNS_BACK and name not in runs):
+            continue
+        if not runs.setdefault(name, []) and _is_whole(segment.path):
+            oldest[name] = TIME_MAX  # this run ended in order
+        if end_ns >= oldest.setdefault(name, end_ns - lookback):
+            runs[name].insert(0, segment.path)
+    made = [path.name for path in (data_dir / FOLDER).glob("*.mcap") if _is_whole(path)]
+    for files in (some for some in reversed(runs.values()) if some):
+        yield from _without_clip(tuple(files), site, settings, of_fault, made)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a recording was finished by the run that wrote it."""
+    try:
+        return REPAIRED_METADATA not in read_metadata(path)
+    except (OSError, ValueError, OverflowError):
+        return False
+
+
+def _without_clip(
+    files: tuple[Path, ...],
+    site: str,
+    settings: EventSettings,
+    of_fault: Mapping[str, Sequence[str]],
+    made: Sequence[str],
+) -> Iterator[Job]:
+    """What a run's own Watch would have asked for, as far as it has not been written."""
+    watch = Watch(settings)
+    found: list[tuple[Job, int]] = []  # with UTC - monotonic
+    offset = now_ns = 0
+    told: list[str] = []  # clips that the run says it has written
+    stopped = False
+    for path in files:
+        for s in read_messages(path, {topics.CHECKPOINT_TOPIC, "/events", "/faults", "/rosout"}):
+            if s.topic == topics.CHECKPOINT_TOPIC:
+                point = topics.decode_checkpoint(s.data)
+                offset, now_ns = point.utc_ns - point.monotonic_ns, max(now_ns, point.monotonic_ns)
+                continue
+            message = topics.decode(s.schema, s.data)
+            now_ns = max(now_ns, s.log_ns - offset)
+            if s.topic == "/rosout":
+                stopped = message["msg"] == "stopped"
+                continue
+            if job := watch.due(now_ns):
+                found.append((job, offset))
+            if s.topic == "/events":
+                take(watch, message, offset)
+            elif message["kind"] == "CLIP":
+                told.append(message["text"])
+            else:
+                for name in of_fault.get(message["kind"], ()):
+                    watch.moment(name, message["monotonic_ns"])
+    if stopped:
+        return
+    now_ns = max(now_ns, newest_ns(files[-1]) - offset) + 1  # an end is exclusive
+    found += [(job, offset) for job in (watch.due(now_ns), watch.rest(now_ns)) if job is not None]
+    for job, of in found:
+        stem = _stem(site, max(0, job.begin_ns + of))
+        if not any(name.startswith(stem) for name in (*made, *told)):
+            yield Job(job.begin_ns, job.end_ns, job.names, files)
+
+
+def take(watch: Watch, event: Mapping[str, Any], offset_ns: int) -> None:
+    """An event of /events; `offset_ns` = UTC - monotonic of its segment."""
+    if event["kind"] == BEGIN:
+        watch.begin(event["source"], event["monotonic_ns"])
+    elif event["kind"] == END:
+        watch.end(event["source"], event["end"]["sec"] * S + event["end"]["nanosec"] - offset_ns)
 
 
 def _between(path: Path, begin_ns: int, end_ns: int) -> Iterator[Stored]:
@@ -281,7 +418,7 @@ def _sources(recent: Sequence[Path], begin_ns: int, end_ns: int) -> Iterator[tup
         for path in (final, final.with_name(final.name + PART)):
             try:
                 first = next(read_messages(path, {topics.CHECKPOINT_TOPIC}), None)
-            except (OSError, DamagedError):  # retention was quicker, or it has just been renamed
+            except (OSError, ValueError, OverflowError):  # retention was quicker, or it has just been renamed
                 continue
             if first is None:
                 continue

@@ -10,7 +10,7 @@ from __future__ import annotations
 import mmap
 import struct
 import zlib
-from collections.abc import Container, Iterator
+from collections.abc import Container, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,11 +26,15 @@ ATTACHMENT, METADATA, DATA_END = 9, 12, 15
 CHUNK_MAX = 1 << 30
 """No chunk that this program or a sane one writes is larger unpacked; a damaged length must not fill the memory."""
 
+LET_GO = 4 << 20
+"""A walk gives back so much of a file at a time."""
+
 Buffer: TypeAlias = bytes | mmap.mmap
 
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
 _MESSAGE = struct.Struct("<HIQQ")
+_WHOLE_MESSAGE = struct.Struct("<BQHIQQ")  # with its record's head
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")
@@ -83,9 +87,14 @@ def view(path: Path) -> Iterator[Buffer]:
 def parts(buffer: Buffer, pos: int = len(MAGIC)) -> Iterator[Part]:
     """Whole records from `pos` on, to the footer or the first that is cut or no record (opcode 0: unwritten space)."""
     end = len(buffer)
+    behind = pos
     while pos + _RECORD.size <= end:
         opcode, length = _RECORD.unpack_from(buffer, pos)
         pos += _RECORD.size
+        if pos - behind > LET_GO and isinstance(buffer, mmap.mmap):  # else the whole file counts as this process's
+            behind -= behind % mmap.PAGESIZE
+            buffer.madvise(mmap.MADV_DONTNEED, behind, pos - behind)
+            behind = pos
         if opcode == 0 or length > end - pos:
             return
         yield Part(opcode, pos, length)
@@ -193,18 +202,82 @@ def _check_magic(buffer: Buffer, path: Path) -> None:
         raise DamagedError(f"{path}: not an MCAP file")
 
 
-def read_messages(path: Path, wanted: Container[str] | None = None) -> Iterator[Stored]:
-    """Messages of the topics `wanted` (None = all) in the order of the file.
+@dataclass
+class Tally:
+    """Messages that a walk has passed, wanted or not, and their smallest and largest log time [UTC ns]."""
+
+    messages: int = 0
+    begin_ns: int = 0
+    end_ns: int = 0
+
+    def add(self, messages: int, begin_ns: int, end_ns: int) -> None:
+        if messages:
+            self.begin_ns = min(self.begin_ns, begin_ns) if self.messages else begin_ns
+            self.end_ns = max(self.end_ns, end_ns)
+            self.messages += messages
+
+
+def read_messages(path: Path, wanted: Container[str] | None = None, tally: Tally | None = None) -> Iterator[Stored]:
+    """Messages of the topics `wanted` (None = all) in the order of the file; `tally` counts all that were passed, and
+    is right when the walk has ended. Topics that are not wanted cost little: ask for what you need.
 
     Raises OSError, DamagedError for a file that is no MCAP or is damaged before its tail. A file that is being written
     gives what was flushed when it was opened.
     """
     with view(Path(path)) as buffer:
         _check_magic(buffer, path)
-        yield from _messages(buffer, Channels(), wanted)
+        yield from _messages(buffer, Channels(), wanted, tally or Tally())
 
 
-def _messages(buffer: Buffer, known: Channels, wanted: Container[str] | None) -> Iterator[Stored]:
+def _in_chunk(
+    data: bytes, known: Channels, wanted: Container[str] | None, named: dict[int, tuple[str, str, bool]], tally: Tally
+) -> Generator[Stored, None, int]:
+    """Messages of an unpacked chunk; returns how far its records reach. `named`: channel -> topic, schema, whether it
+    is wanted, as far as met. This loop is where a walk spends its time."""
+    unpack, size = _WHOLE_MESSAGE.unpack_from, _WHOLE_MESSAGE.size
+    pos, end = 0, len(data)
+    count, low, high = 0, 1 << 64, 0
+    try:
+        while pos + size <= end:
+            opcode, length, channel, sequence, log_ns, publish_ns = unpack(data, pos)
+            if opcode != MESSAGE:
+                if opcode == 0 or length > end - pos - _RECORD.size:
+                    break
+                if opcode in (SCHEMA, CHANNEL):
+                    known.meet(data, Part(opcode, pos + _RECORD.size, length))
+                    named.clear()
+                pos += _RECORD.size + length
+                continue
+            begin = pos + size
+            pos += _RECORD.size + length
+            if pos > end:
+                pos = begin - size
+                break
+            if channel not in named or pos < begin:
+                first = known.message(data, Part(MESSAGE, begin - _MESSAGE.size, length))
+                named[channel] = first.topic, first.schema, wanted is None or first.topic in wanted
+            count += 1
+            if log_ns > high:
+                high = log_ns
+            if log_ns < low:
+                low = log_ns
+            topic, schema, yes = named[channel]
+            if yes:
+                yield Stored(topic, schema, log_ns, publish_ns, sequence, data[begin:pos])
+        for part in parts(data, pos):  # the last records, where they are shorter than a message's head
+            if part.opcode == MESSAGE:
+                known.message(data, part)  # cut: raises
+            elif part.opcode in (SCHEMA, CHANNEL):
+                known.meet(data, part)
+                named.clear()
+            pos = part.pos + part.length
+    finally:
+        tally.add(count, low, high)
+    return pos
+
+
+def _messages(buffer: Buffer, known: Channels, wanted: Container[str] | None, tally: Tally) -> Iterator[Stored]:
+    named: dict[int, tuple[str, str, bool]] = {}
     for part in parts(buffer):
         if part.opcode == CHUNK:
             try:
@@ -213,23 +286,16 @@ def _messages(buffer: Buffer, known: Channels, wanted: Container[str] | None) ->
                 if next(parts(buffer, part.pos + part.length), None) is None:  # the last thing written: a torn tail
                     return
                 raise
-            inner = 0
-            for inner_part in parts(data, 0):
-                inner = inner_part.pos + inner_part.length
-                if inner_part.opcode == MESSAGE:
-                    stored = known.message(data, inner_part)
-                    if wanted is None or stored.topic in wanted:
-                        yield stored
-                elif inner_part.opcode in (SCHEMA, CHANNEL):
-                    known.meet(data, inner_part)
-            if inner != len(data):
+            if (yield from _in_chunk(data, known, wanted, named, tally)) != len(data):
                 raise DamagedError(f"chunk at byte {part.pos}: its records do not fill it")
         elif part.opcode == MESSAGE:
             stored = known.message(buffer, part)
+            tally.add(1, stored.log_ns, stored.log_ns)
             if wanted is None or stored.topic in wanted:
                 yield stored
         elif part.opcode in (SCHEMA, CHANNEL):
             known.meet(buffer, part)
+            named.clear()
         elif part.opcode == DATA_END:
             return
 
@@ -332,6 +398,11 @@ def head_metadata(path: Path, name: str) -> dict[str, str]:
     return {}
 
 
+def count(text: str) -> int:
+    """A count that a metadata record holds as text; 0 where it is none, whatever else stands there."""
+    return int(text) if text.isdecimal() and len(text) < 20 else 0
+
+
 def parse_metadata(buffer: Buffer, part: Part) -> tuple[str, dict[str, str]]:
     """A metadata record: its name and its strings."""
     end = part.pos + part.length
@@ -418,7 +489,7 @@ def info(path: Path) -> Info:
                     result.metadata[name] = values
                 elif part.opcode == FOOTER:
                     result.complete = buffer[part.pos + part.length :] == MAGIC
-            for stored in _messages(buffer, known, None):
+            for stored in _messages(buffer, known, None, Tally()):
                 _count(result, stored)
                 if stored.topic.startswith(topics.RAW_PREFIX) and stored.topic != topics.CHECKPOINT_TOPIC:
                     order = topics.raw_order(stored.schema, stored.data)

@@ -4,8 +4,8 @@ A `Rotate` closes the open segment and opens the next, whose first record is the
 opens or closes one. Names are `<site>_<YYYYMMDDTHHMMSSZ>_<NNN>.mcap`, with `.part` behind while the file is open; NNN
 counts files of one second, so no two files ever share a name. Each file's metadata names the file before it and that
 file's SHA-256. Retention looks only at names of this form and this site: older than `keep_days` (by a disciplined clock
-only: one wrong step must not empty the disk), more than `keep_gb` together, less than `free_gb` free where deleting can
-reach that; it never touches the open file.
+only, that has run for hours without a step: one wrong step must not empty the disk), more than `keep_gb` together, less
+than `free_gb` free where deleting can reach that; it never touches the open file.
 
 One thread drives a Recorder; time is an argument (monotonic ns). When the disk fails, the open file is sealed as far as
 it goes and RecordingError is raised; the Recorder then has no open file until the next Rotate.
@@ -39,6 +39,9 @@ RECENT = 1000
 """Files of this run whose names are kept for event clips; an hour of them where a file lasts four seconds."""
 RETENTION_NS = 60 * S
 """How often retention looks at the folder while a file is open: other programs fill disks too."""
+BELIEVED_NS = 6 * 3600 * S
+"""How long a disciplined clock must have run without a step before files are deleted for their age: one that was set a
+year ahead, and is set back within hours, must not empty the disk."""
 
 _NAME = r"_(\d{8}T\d{6}Z)_(\d{3,})\.mcap"
 
@@ -107,7 +110,10 @@ class Recorder:
         self._now_ns = 0
         self._utc = PLAUSIBLE
         self._sync = False
+        self._since_ns: int | None = None  # since when the clock has gone on without a step, monotonic
+        self._short = False  # of space that deleting cannot give, as told
         self._flushed_ns = self._synced_ns = self._pruned_ns = 0
+        self._ahead_ns = 0  # an fsync begins so much before it is due
 
     @property
     def path(self) -> Path | None:
@@ -140,22 +146,36 @@ class Recorder:
             raise self._fail(e) from e
 
     def wait_s(self, now_ns: int) -> float:
-        """Seconds until `idle` has to flush, at most 1: time that the disk took counts, or a kill would cost more."""
+        """Seconds until `idle` has to flush or fsync, at most 1: time that the disk took counts, or a kill would cost
+        more."""
         if self._writer is None:
             return min(self.settings.flush_s, 1.0)
-        due_s = (self._flushed_ns - now_ns) / S + self.settings.flush_s
-        return min(max(due_s, 0.0), 1.0)
+        due_ns = min(self._flushed_ns + self.settings.flush_s * S, self._fsync_due_ns)
+        return min(max((due_ns - now_ns) / S, 0.0), 1.0)
 
-    def idle(self, now_ns: int) -> None:
-        """Do what is due: flush every `flush_s`, fsync every `fsync_s`, retention every minute. RecordingError."""
+    @property
+    def _fsync_due_ns(self) -> float:
+        return self._synced_ns + self.settings.fsync_s * S - self._ahead_ns
+
+    def fsync_took(self, ns: int) -> None:
+        """How long the last fsync took, with the records before it. What a power cut costs counts until its end, so on
+        a slow disk the next ones begin earlier; by half of `fsync_s` at most."""
+        self._ahead_ns = int(min(max(ns, 0.9 * self._ahead_ns), self.settings.fsync_s * S / 2))
+
+    def idle(self, now_ns: int, begun_ns: int = 0) -> bool:
+        """Do what is due: flush every `flush_s`, fsync every `fsync_s`, retention every minute. Whether an fsync was
+        done. `begun_ns`: records that came later may still wait outside (0 = none does). RecordingError."""
         self._now_ns = now_ns
         writer = self._writer
         if writer is None:
-            return
+            return False
+        synced = now_ns >= self._fsync_due_ns
         try:
-            if now_ns - self._synced_ns >= self.settings.fsync_s * S:
+            if synced or now_ns - self._flushed_ns >= self.settings.flush_s * S:
+                writer.look()
+            if synced:
                 writer.fsync()
-                self._synced_ns = self._flushed_ns = now_ns
+                self._synced_ns, self._flushed_ns = begun_ns or now_ns, now_ns
             elif now_ns - self._flushed_ns >= self.settings.flush_s * S:
                 writer.flush()
                 self._flushed_ns = now_ns
@@ -166,6 +186,7 @@ class Recorder:
                 self._retain()
             except OSError as e:  # the folder cannot be read; whether it can be written shows at the next record
                 self._faults.append(Fault(now_ns, "recorder", "RETENTION_FAILED", f"{self.data_dir}: {e}"))
+        return synced
 
     def close(self) -> Path | None:
         """Finish the open segment; return its final path. RecordingError."""
@@ -191,6 +212,8 @@ class Recorder:
         lost = unfinished.unwritten if unfinished else ()
         self._utc = datetime.fromtimestamp(rotate.utc_ns // S, UTC)
         self._sync = rotate.sync
+        if self._since_ns is None or rotate.reason == "clock" or not rotate.sync:
+            self._since_ns = self._now_ns
         try:
             self.data_dir.mkdir(parents=True, exist_ok=True)
             self._retain()
@@ -260,7 +283,7 @@ class Recorder:
         self._pruned_ns = self._now_ns
         segments = list_segments(self.data_dir, self.site)
         keep = timedelta(days=self.settings.keep_days)
-        if self._utc >= PLAUSIBLE and self._sync:
+        if self._utc >= PLAUSIBLE and self._sync and self._now_ns - (self._since_ns or 0) >= BELIEVED_NS:
             for segment in list(segments):
                 if PLAUSIBLE <= segment.begin < self._utc - keep:
                     self._delete(segment, f"older than {self.settings.keep_days:g} days")
@@ -270,11 +293,32 @@ class Recorder:
             segment = segments.pop(0)
             if self._delete(segment, f"more than {self.settings.keep_gb:g} GB of recordings"):
                 total -= segment.size
-        missing = self.settings.free_gb * GB - self.free_bytes()
-        if missing > sum(segment.size for segment in segments):
+        free = self.free_bytes()
+        if free < 0:
+            return  # the file system does not say
+        missing = self.settings.free_gb * GB - free
+        held = sum(segment.size for segment in segments)
+        if missing > held:
+            self._tell_short(missing, held)
             return  # something else fills the disk: deleting every recording would not reach the limit either
+        self._short = False
         while segments and self.free_bytes() < self.settings.free_gb * GB:
             self._delete(segments.pop(0), f"less than {self.settings.free_gb:g} GB free")
+
+    def _tell_short(self, missing: float, held: int) -> None:
+        """Clips, or what is not ours, fill the disk; told once until there is room again."""
+        if self._short:
+            return
+        self._short = True
+        kept = 0
+        with suppress(OSError):
+            kept = sum(p.stat().st_size for p in (self.data_dir / "clips").iterdir())
+        text = (
+            f"{missing / GB:.3g} GB are missing to the {self.settings.free_gb:g} GB that should stay free; all files "
+            f"that could be deleted hold {held / GB:.3g} GB, clips, which are never deleted, {kept / GB:.3g} GB: move "
+            "clips away, or what else fills the disk"
+        )
+        self._faults.append(Fault(self._now_ns, "recorder", "SPACE_SHORT", text, (("missing_bytes", missing),)))
 
     def _delete(self, segment: Segment, why: str) -> bool:
         try:

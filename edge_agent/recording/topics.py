@@ -526,7 +526,9 @@ def decode_accel_block(source: str, data: bytes) -> AccelBlock:
     flags = stream.column("u1")
     offset, count = stream.column("<i8"), stream.column("<i8")
     _same_length(*axes, flags, offset, count)
-    return AccelBlock(source, first + offset, np.stack(axes, axis=1).astype(np.float64), flags, count, drain)
+    with np.errstate(invalid="ignore"):  # a damaged number may be a signalling NaN
+        xyz = np.stack(axes, axis=1).astype(np.float64)
+    return AccelBlock(source, first + offset, xyz, flags, count, drain)
 
 
 def decode_fused_block(point: str, data: bytes) -> Estimate:
@@ -538,7 +540,10 @@ def decode_fused_block(point: str, data: bytes) -> Estimate:
     mode, flags = stream.column("u1"), stream.column("u1")
     offset = stream.column("<i8")
     _same_length(*columns, mode, flags, offset)
-    moved, speed, std_moved, std_speed = (np.stack(columns[i : i + 3], axis=1).astype(np.float64) for i in (0, 3, 6, 9))
+    with np.errstate(invalid="ignore"):  # a damaged number may be a signalling NaN
+        moved, speed, std_moved, std_speed = (
+            np.stack(columns[i : i + 3], axis=1).astype(np.float64) for i in (0, 3, 6, 9)
+        )
     bias, std_bias, level, std_level = (np.array(threes[i : i + 3]) for i in (0, 3, 6, 9))
     t_ns = first + offset
     return Estimate(

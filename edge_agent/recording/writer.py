@@ -122,6 +122,13 @@ class SegmentWriter:
             self._file.flush()  # else a part of it waits here, to be lost uncounted at the next error
             self._pending.clear()
 
+    def look(self) -> None:
+        """See that what is written still goes somewhere. OSError where the file was taken away, or its file system was
+        made read-only by force: no write fails for that, it goes into memory that is thrown away."""
+        os.stat(self.path)
+        if os.fstatvfs(self._file.file.fileno()).f_flag & os.ST_RDONLY:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self.path))
+
     def flush(self) -> None:
         """Close the open chunk and hand everything to the operating system."""
         self._writer.flush()

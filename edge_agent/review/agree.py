@@ -16,7 +16,7 @@ var(offset) = 1 / sum(v^2/S) is reached by no other estimator.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import permutations
 
 import numpy as np
@@ -41,6 +41,8 @@ ALARM = 10.0
 """Log likelihood against the accelerometer in one window that is called a contradiction,"""
 ALARM_EACH = 0.05
 """and so much more for every value in it: integrated noise costs a little where nothing moves."""
+FEW, OFTEN = 2, 0.25
+"""So many windows, or so large a share of them, may speak against the accelerometer where nothing can be found."""
 RIVALS = 4
 """Hills of the scan that are looked at closely, where the highest does not stand out."""
 MOST = 2400
@@ -49,6 +51,8 @@ NOISE = 1000
 """and those that the noise is estimated from."""
 COARSE, COARSE_S = 1000, 0.25
 """The scan of all offsets takes so many of them, at least so far apart."""
+FAST_MPS = 0.5
+"""rms speed from which a receiver's own speeds say something: no structure reaches it, a vehicle does."""
 CLOCK_S = 0.02
 """An offset below is within what receivers' latencies are known to."""
 
@@ -131,7 +135,8 @@ class Mounting:
 class Agreement:
     """What the two sensors say of each other. t_ns (n,): ends of windows; support (n,): log likelihood with against
     without the accelerometer as configured, per window; contradictions: spans (begin_ns, end_ns) of windows against it.
-    verdict: "AGREE", "CONTRADICTION", "NOT OBSERVABLE"; text: one sentence for the head of the report."""
+    verdict: "AGREE", "CONTRADICTION", "NOT OBSERVABLE"; text: one sentence for the head of the report. by_speed: the
+    offset by the receiver's speeds in place of its positions, where it moves fast enough and told them."""
 
     verdict: str
     text: str
@@ -141,6 +146,7 @@ class Agreement:
     t_ns: I64
     support: F64
     contradictions: list[tuple[int, int]] = field(default_factory=list)
+    by_speed: Offset | None = None
 
 
 def busiest(fixes: Fixes, accel: Accelerations, most: int = MOST) -> Fixes:
@@ -215,7 +221,7 @@ def scan(lanes: _Lanes, offsets_s: F64) -> Scan:
     counts = np.maximum((lanes.axes != 0).sum(axis=0), 1)
     total = (lanes.axes**2).sum(axis=0)
     power = float((np.abs(lanes.plane) ** 2).sum())
-    step = max(1, 3_000_000 // (12 * len(lanes.t)))
+    step = max(1, 1_000_000 // (12 * len(lanes.t)))
     for lo in range(0, len(offsets_s), step):
         k = slice(lo, lo + step)
         e = lanes.accelerations(offsets_s[k])
@@ -390,9 +396,10 @@ def agree(fixes: Fixes, accel: Accelerations, *, search_s: float = SEARCH_S) -> 
         close = scan(_Lanes(part, accel, alone), free_peak + 0.125 * step * np.arange(-16.0, 17.0))
         return _turning(found, close, flipped, t_ns, gain, against)
     if found.fixed[k] < LEAST:
-        why = "the motion is too small for the receiver: nothing in the accelerations explains the fixes"
-        verdict = "CONTRADICTION" if against else "NOT OBSERVABLE"
-        text = f"{why}; and they speak against the accelerometer" if against else why
+        why = "no offset stands out: the motion is too small for the receiver, or the accelerations are too noisy"
+        much = len(against) > max(FEW, OFTEN * len(t_ns))
+        verdict = "CONTRADICTION" if much else "NOT OBSERVABLE"
+        text = f"{why}; and they speak against the accelerometer" if much else why
         return Agreement(verdict, text, _no_offset(why), _no_mounting(why), found, t_ns, gain, against)
     tried = []
     busy = busiest(part, accel, NOISE)
@@ -425,6 +432,30 @@ def agree(fixes: Fixes, accel: Accelerations, *, search_s: float = SEARCH_S) -> 
         return Agreement("CONTRADICTION", text, offset, mounting, found, t_ns, gain, against)
     text = "receiver and accelerometer tell of the same motion"
     return Agreement("AGREE", text, offset, mounting, found, t_ns, gain, against)
+
+
+def with_speeds(a: Agreement, fixes: Fixes, velocity_mps: F64, accel: Accelerations) -> Agreement:
+    """The same with the offset by the receiver's speeds (n, 2) along x and y, NaN = not told.
+
+    A receiver filters positions and speeds differently: the speed of one that measures it over the epoch before is half
+    an epoch late. The two offsets differ by that, and which clock was meant is not for the data to say."""
+    told = np.isfinite(velocity_mps).all(axis=1)
+    if not a.offset.observable or told.mean() < 0.9 or np.sqrt(np.mean(velocity_mps[told] ** 2)) < FAST_MPS:
+        return a
+    t = (fixes.t_ns - fixes.t_ns[0]) * NS
+    v = np.stack([np.interp(t, t[told], velocity_mps[told, i]) for i in range(2)], axis=1)
+    z = fixes.z_m.copy()
+    moved = 0.5 * (v[1:] + v[:-1]) * np.diff(t)[:, None]
+    z[:, :2] = np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
+    other = agree(Fixes(fixes.t_ns, z, fixes.std_m, fixes.level, fixes.step), accel).offset
+    if not other.observable:
+        return a
+    apart = other.value_s - a.offset.value_s
+    text = f"{a.text}; by the receiver's speeds the offset is {other.value_s:.3f} s"
+    if abs(apart) > CLOCK_S:
+        late = "later" if apart > 0 else "earlier"
+        text += f": it tells its speeds {abs(apart):.3f} s {late} than its positions"
+    return replace(a, text=text, by_speed=other)
 
 
 def _peak(offset_s: F64, value: F64) -> tuple[float, float]:

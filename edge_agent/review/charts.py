@@ -7,7 +7,10 @@ span, drawn as an area, so no extreme is lost.
 
 from __future__ import annotations
 
+import base64
 import math
+import struct
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -76,6 +79,7 @@ class Plot:
     y: Scale
     height: int = 190
     places: int = 7  # labels on x at most
+    alone: bool = False  # a time axis of its own: it does not zoom with the others
     layers: list[str] = field(default_factory=list)
     legend: list[tuple[str, str, str]] = field(default_factory=list)  # colour, shape, text
 
@@ -98,7 +102,9 @@ class Plot:
             self.layers.append(f'<path d="{d}" fill="{colour}" opacity="{opacity:g}" {edge}/>')
         self._legend(colour, "line" if solid else "band", text)
 
-    def bars(self, x: npt.NDArray[Any], low: F64, high: F64, colour: str, text: str) -> None:
+    def bars(
+        self, x: npt.NDArray[Any], low: F64, high: F64, colour: str, text: str, big: bool = False, opacity: float = 1.0
+    ) -> None:
         """A stroke from low to high at each x, a dot where they are equal."""
         good = np.isfinite(low) & np.isfinite(high)
         if good.any():
@@ -106,12 +112,13 @@ class Plot:
             _, hi = self._xy(x[good], high[good])
             d: list[str] = []
             at = 0, 0
-            kind = "dot" if len(px) < 1200 else "dot dense"
+            kind = "dot big" if big else "dot" if len(px) < 1200 else "dot dense"
+            faint = "" if opacity == 1.0 else f' opacity="{opacity:g}"'
             for a, b, c in zip(px, lo, hi, strict=True):
                 d.append(f"m{a - at[0]} {b - at[1]}v{c - b}" if d else f"M{a} {b}v{c - b}")
                 at = a, c
-            self.layers.append(f'<path d="{"".join(d)}" fill="none" stroke="{colour}" class="v {kind}"/>')
-        self._legend(colour, "dot", text)
+            self.layers.append(f'<path d="{"".join(d)}" fill="none" stroke="{colour}" class="v {kind}"{faint}/>')
+        self._legend(colour, "dot" if opacity == 1.0 else "band", text)
 
     def line(self, x: npt.NDArray[Any], y: F64, colour: str, text: str, far: float = math.inf) -> None:
         for part in _unbroken(x, y, y, far):
@@ -128,6 +135,26 @@ class Plot:
                 f'<rect x="{a:.0f}" y="{H * (1 - high):.0f}" width="{max(b - a, 8):.0f}" '
                 f'height="{H * (high - low):.0f}" fill="{colour}"><title>{escape(title)}</title></rect>'
             )
+
+    def box(self, x0: float, x1: float, y0: float, y1: float, colour: str, title: str) -> None:
+        """A box between values."""
+        a, b = (float(v) for v in self.x.map(np.array([x0, x1]), W))
+        c, d = (H - float(v) for v in self.y.map(np.array([y0, y1]), H))
+        self.layers.append(
+            f'<rect x="{a:.0f}" y="{min(c, d):.0f}" width="{max(b - a, 8):.0f}" height="{abs(c - d):.0f}" '
+            f'fill="{colour}"><title>{escape(title)}</title></rect>'
+        )
+
+    def image(self, x: tuple[float, float], y: tuple[float, float], shade: F64) -> None:
+        """A picture between two values of each axis: shade (rows, columns) 0 to 1, the first row at the low end of y,
+        white to dark blue."""
+        a, b = (float(v) for v in self.x.map(np.array(x), W))
+        c, d = (H - float(v) for v in self.y.map(np.array(y), H))
+        data = base64.b64encode(png(shade[::-1])).decode()
+        self.layers.append(
+            f'<image x="{a:.0f}" y="{d:.0f}" width="{b - a:.0f}" height="{c - d:.0f}" preserveAspectRatio="none" '
+            f'href="data:image/png;base64,{data}"/>'
+        )
 
     def mark(self, x: float, colour: str, title: str) -> None:
         at = float(self.x.map(np.array([x]), W)[0])
@@ -147,12 +174,13 @@ class Plot:
     def html(self, title: str, values: bool = True) -> str:
         """The whole figure. `values` False: no numbers on y (strips)."""
         xs = ticks(self.x, self.places)
-        ys = ticks(self.y, 5) if values else []
+        about = max(2, min(5, self.height // 30)) if self.y.log else 5  # powers may come two to a label's height
+        ys = ticks(self.y, about) if values else []
         grid = "".join(f'<path d="M{W * p / 100:.0f} 0V{H}"/>' for p, _ in xs)
         grid += "".join(f'<path d="M0 {H - H * p / 100:.0f}H{W}"/>' for p, _ in ys)
         x_text = "".join(f'<span style="left:{p:.2f}%">{t}</span>' for p, t in xs)
         y_text = "".join(f'<span style="top:{100 - p:.2f}%">{t}</span>' for p, t in ys)
-        kinds = "time" if self.x.time else "log" if self.x.log else "lin"
+        kinds = ("own" if self.alone else "time") if self.x.time else "log" if self.x.log else "lin"
         x0, x1 = (self.x.low / 1e6, self.x.high / 1e6) if self.x.time else (self.x.low, self.x.high)
         keys = "".join(
             f'<span class="key"><i class="{shape}" style="--c:{colour}"></i>{escape(text)}</span>'
@@ -173,6 +201,37 @@ class Plot:
             f'<div class="yt">{y_text}</div><div class="xt">{x_text}</div></div>'
             f'<div class="xl">{escape(self.x.label)}</div></figure>'
         )
+
+
+SHADES = ((255, 255, 255), (222, 235, 247), (158, 202, 225), (66, 146, 198), (8, 81, 156), (8, 29, 70))
+"""From nothing to much: one hue that darkens, so it reads in grey and by the colour-blind."""
+
+
+def shade_colour(share: float) -> str:
+    at = min(max(share, 0.0), 1.0) * (len(SHADES) - 1)
+    k = min(int(at), len(SHADES) - 2)
+    mixed = (round(a + (b - a) * (at - k)) for a, b in zip(SHADES[k], SHADES[k + 1], strict=True))
+    return "#" + "".join(f"{v:02x}" for v in mixed)
+
+
+def png(shade: F64) -> bytes:
+    """A picture of shades (rows, columns) 0 to 1 with a palette of 256 (PNG, ISO/IEC 15948)."""
+    rows, columns = shade.shape
+    values = np.rint(np.clip(shade, 0.0, 1.0) * 255).astype(np.uint8)
+    palette = bytes.fromhex("".join(shade_colour(k / 255)[1:] for k in range(256)))
+    lines = np.concatenate([np.zeros((rows, 1), np.uint8), values], axis=1).tobytes()
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)
+    parts = (
+        chunk(b"IHDR", head),
+        chunk(b"PLTE", palette),
+        chunk(b"IDAT", zlib.compress(lines, 9)),
+        chunk(b"IEND", b""),
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
 def _unbroken(x: npt.NDArray[Any], low: F64, high: F64, far: float) -> list[slice]:
@@ -207,18 +266,19 @@ def ticks(scale: Scale, about: int) -> list[tuple[float, str]]:
     if scale.time:
         return _time_ticks(round(low), round(high), about)
     if scale.log:
-        whole = range(math.ceil(low - 1e-9), math.floor(high + 1e-9) + 1)
+        whole = range(math.floor(low - 1e-9), math.floor(high + 1e-9) + 1)
         every = max(1, math.ceil(len(whole) / (about + 2)))
-        if len(whole) >= 2:
-            out = [((k - low) / size * 100, _power(k)) for k in whole if k % every == 0]
-            if len(whole) < 4:
-                for k in (*whole, whole[0] - 1):
-                    for m in (2, 5):
-                        at = k + math.log10(m)
-                        if low <= at <= high:
-                            out.append(((at - low) / size * 100, _plain(m * 10.0**k)))
-            return sorted(out)
-        return [(p, _plain(10 ** (low + p / 100 * size))) for p in (0.0, 50.0, 100.0)]
+        for steps in ((1, 2, 5), (1,)):
+            found = [(k, m, k + math.log10(m)) for k in whole for m in steps if k % every == 0]
+            found = [row for row in found if low - 1e-9 <= row[2] <= high + 1e-9]
+            if len(found) <= about + 3 or len(steps) == 1:
+                break
+        if len(found) >= 2:
+            texts = [_power(k) if m == 1 else _plain(m * 10.0**k) for k, m, _ in found]
+            return [((at - low) / size * 100, t) for (_, _, at), t in zip(found, texts, strict=True)]
+        linear = ticks(Scale(10**low, 10**high, ""), 5)
+        values = [10**low + p / 100 * (10**high - 10**low) for p, _ in linear]
+        return [((math.log10(v) - low) / size * 100, t) for v, (_, t) in zip(values, linear, strict=True) if v > 0]
     step = 10.0 ** math.floor(math.log10(size / about))
     step = next(s for s in (step, 2 * step, 5 * step, 10 * step) if size / s <= about)
     digits = max(0, -math.floor(math.log10(step) + 1e-9))
@@ -269,7 +329,7 @@ def limits(*values: F64, room: float = 0.06) -> tuple[float, float]:
     if not flat:
         return -1.0, 1.0
     low, high = float(min(v.min() for v in flat)), float(max(v.max() for v in flat))
-    pad = room * (high - low) or max(abs(high), 1e-6) * 0.1
+    pad = room * (high - low) or max(0.1 * abs(high), 1e-3)
     return low - pad, high + pad
 
 

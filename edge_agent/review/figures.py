@@ -12,11 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from edge_agent.cat import iso
-from edge_agent.messages import AccelFlag, S, Verdict
+from edge_agent.messages import F64, AccelFlag, S, Verdict
 from edge_agent.review.agree import CLOCK_S, Agreement
 from edge_agent.review.charts import length, utc
 from edge_agent.review.gather import Extreme, PointFigures, Review, gaps_of, modes_of
+from edge_agent.review.modal import in_phase
 from edge_agent.review.panels import AXES, MM, SENSOR_EVENTS, absent, mm, number, offset_known, percent, quality_name
+from edge_agent.review.panels_estimates import honest_words
+from edge_agent.review.sources import differences
 from edge_agent.review.spectra import Spectrum
 
 OFTEN = 0.25
@@ -63,7 +66,7 @@ def _spectrum(s: Spectrum | None) -> dict[str, Any] | None:
 
 def _point(r: Review, name: str, p: PointFigures) -> dict[str, Any]:
     point = r.overview.points[name]
-    a, d = p.agreement, p.differences
+    a = p.agreement
     n = sum(point.verdicts.values())
     return {
         "receiver": p.receiver or None,
@@ -101,6 +104,7 @@ def _point(r: Review, name: str, p: PointFigures) -> dict[str, Any]:
         "track": {
             "utc": [iso(t) for t in p.track[0].tolist()],
             "freq_hz": [[_value(v, 6) for v in row] for row in p.track[1].tolist()],
+            "std_hz": [[_value(v, 3) for v in row] for row in p.track[2].tolist()],
         },
         "spectra": {
             "accelerations_m2ps4pHz": _spectrum(p.accel_spectrum),
@@ -115,20 +119,156 @@ def _point(r: Review, name: str, p: PointFigures) -> dict[str, Any]:
             "offset_s": _value(a.offset.value_s) if offset_known(a) else None,
             "std_offset_s": _value(a.offset.std_s) if offset_known(a) else None,
             "offset_observable": offset_known(a),
+            "offset_by_speed_s": None if a.by_speed is None else _value(a.by_speed.value_s),
+            "std_offset_by_speed_s": None if a.by_speed is None else _value(a.by_speed.std_s),
             "yaw_deg": _value(a.mounting.yaw_deg),
             "std_yaw_deg": _value(a.mounting.std_yaw_deg),
             "axes": list(a.mounting.axes),
             "mounting_observable": a.mounting.observable,
         },
-        "second_difference": None
-        if d is None
-        else {
-            "correlation": [_value(float(v)) for v in d.correlation],
-            "gain": [_value(float(v)) for v in d.gain],
-            "rms_mps2": [_value(float(v)) for v in d.rms_mps2],
+        "second_difference": {
+            what: {
+                "correlation": _three(d.correlation),
+                "gain": _three(d.gain),
+                "rms_mps2": _three(d.rms_mps2),
+                "rms_difference_mps2": _three(d.rms_difference_mps2),
+            }
+            for what, d in ({} if p.checks is None else p.checks.differences).items()
         },
-        "critical_hz": None if p.split is None else _value(p.split.critical_hz),
+        "split": _split(p),
+        "wavelets": _wavelets(p),
+        "heading": _heading(r, name),
+        "innovations": _innovations(r, name),
         "notes": p.notes,
+    }
+
+
+def _three(x: F64) -> list[float | None]:
+    return [_value(float(v)) for v in x]
+
+
+def _split(p: PointFigures) -> dict[str, Any] | None:
+    if p.split is None:
+        return None
+    a = p.apart
+    return {
+        "critical_hz": _value(p.split.critical_hz),
+        "compared_s": None if a is None else _value(a.seconds),
+        "share_of_d_type": None if a is None else _value(a.d_share),
+        "rms_filter_m": None if a is None else _three(a.filter_m),
+        "rms_g_type_less_filter_m": None if a is None else _three(a.g_type_m),
+        "rms_d_type_less_filter_m": None if a is None else _three(a.d_type_m),
+        "rms_merged_less_filter_m": None if a is None else _three(a.merged_m),
+    }
+
+
+def _wavelets(p: PointFigures) -> dict[str, Any] | None:
+    w = p.wavelets
+    if w is None:
+        return None
+    return {
+        "axis": AXES[w.axis],
+        "begin_utc": iso(w.begin_ns),
+        "seconds": _value(w.seconds),
+        "bands": [
+            {
+                "freq_hz": _value(b.freq_hz),
+                "low_hz": _value(b.low_hz),
+                "high_hz": _value(b.high_hz),
+                "rms_fused_m": _value(b.rms_m),
+                "rms_gnss_m": _value(b.fixes_rms_m),
+                "largest_fused_m": _value(b.largest_m),
+            }
+            for b in w.bands
+        ],
+    }
+
+
+def _heading(r: Review, name: str) -> dict[str, Any] | None:
+    h = r.estimates.headed.get(name)
+    if h is None:
+        return None
+    return {
+        "headings": sum(h.verdicts.values()),
+        "verdicts": {Verdict(v).name: k for v, k in sorted(h.verdicts.items())},
+        "last_deg": _value(h.last_deg),
+        "std_last_deg": _value(h.last_std_deg),
+        "baseline_m": _value(h.baseline_m),
+        "innovation2_over_variance": _value(h.mean_nis),
+    }
+
+
+def _innovations(r: Review, name: str) -> dict[str, Any] | None:
+    g = r.estimates.gated.get(name)
+    if g is None or not g.count:
+        return None
+    n, used = g.declared_count, g.accepted
+    return {
+        "at_the_gate": g.count,
+        "accepted": used,
+        "innovation2_over_variance": _value(g.mean_nis),
+        "std_innovation2_over_variance": _value(g.std_nis),
+        "likeness_of_neighbours": _three(g.whiteness),
+        "per_bin_of_chi2_probability": g.chance.tolist(),
+        "verdict": honest_words(g),
+        "rms_std_declared_m": _three(np.sqrt(g.declared / n)) if n else None,
+        "rms_std_used_m": _three(np.sqrt(g.used / used)) if used else None,
+    }
+
+
+def _modal(r: Review) -> dict[str, Any] | None:
+    m = r.modal
+    if m is None:
+        return None
+    return {
+        "begin_utc": iso(m.begin_ns),
+        "seconds": _value(m.seconds),
+        "channels": m.names,
+        "missing": m.why or None,
+        "modes": [
+            {
+                "freq_hz": _value(k.freq_hz),
+                "std_freq_hz": _value(k.std_freq_hz),
+                "damping": _value(k.damping),
+                "std_damping": _value(k.std_damping),
+                "singular_values_hz": _value(k.fdd_hz),
+                "share_of_orders": _value(k.share),
+                "in_phase": _value(in_phase(k.shape)),
+                "shape": {n: [_value(v.real, 4), _value(v.imag, 4)] for n, v in zip(b.names, k.shape, strict=True)},
+            }
+            for b in m.bands
+            for k in b.modes
+        ],
+    }
+
+
+def _clocks(r: Review) -> dict[str, Any]:
+    e = r.estimates
+    return {
+        "host": [
+            {
+                "run": run,
+                "ticks": c.ticks,
+                "synchronised": _value(c.synchronised / c.ticks),
+                "largest_error_s": _value(c.error_s) if c.error_s > 0 else None,
+                "utc_against_monotonic_ppm": _value(c.rate_ppm()),
+            }
+            for run, c in e.clocks.items()
+        ],
+        "accelerometers": {name: {"rate_hz": _value(float(t.columns()[1].mean()))} for name, t in e.rates.items()},
+        "at_the_heads_of_files": [
+            {
+                "utc": iso(h.utc_ns),
+                "points": {
+                    name: {"q_m2ps3": _three(q), "qb_m2ps5": _three(qb), "factor_on_variance": _three(factor)}
+                    for name, (q, qb, factor) in h.points.items()
+                },
+                "accelerometer_rate_error": {name: _value(v) for name, v in h.rates.items()},
+                "latency_s": {name: _value(v) for name, (v, _) in h.latencies.items()},
+                "latency_is": {name: how for name, (_, how) in h.latencies.items()},
+            }
+            for h in e.heads[:LISTED]
+        ],
     }
 
 
@@ -154,6 +294,10 @@ def as_json(r: Review) -> dict[str, Any]:
             "fixes": n,
             "rate_hz": _value(S / x.stream.usual_ns) if x.stream.usual_ns else None,
             "quality": {quality_name(q): _value(k / n) for q, k in sorted(x.qualities.items())},
+            "fixes_by_quality": {quality_name(q): k for q, k in sorted(x.qualities.items())},
+            "quality_history": [
+                {"begin_utc": iso(a), "end_utc": iso(b), "quality": quality_name(q)} for a, b, q in x.spells[:LISTED]
+            ],
             "mean_latency_s": _value(float(latency.mean[0])) if latency.n else None,
             "std_latency_s": _value(float(latency.std[0])) if latency.n else None,
             "llh_deg_deg_m": [_value(v, 12) for v in place] if place else None,
@@ -208,8 +352,12 @@ def as_json(r: Review) -> dict[str, Any]:
             }
             for h in r.overview.happened[:LISTED]
         ],
+        "modal": _modal(r),
+        "clocks": _clocks(r),
         "runs": len([run for run in r.overview.runs if run]) or 1,
-        "configurations": r.configs,
+        "configurations": [{"files": [str(p) for p in s.files]} for s in r.setups],
+        "settings_that_differ": dict(differences(r.setups)),
+        "copies": [{"file": str(a), "all_of_it_is_in": str(b)} for a, b in sorted(r.copies.items())],
         "verify": checked,
     }
 
@@ -226,7 +374,9 @@ def conclusions(r: Review) -> list[str]:
     ]
     for name, p in r.points.items():
         if not p.moments.n:
-            out.append(f"{name}: no valid displacement in this period.")
+            text = "no valid displacement in this period" if p.receiver else "no receiver, so vibration only"
+            out.append(f"{name}: {text}.")
+            out += _frequencies(name, p)
             continue
         words = [f"{name}: a valid displacement for {percent(availability_of(r, p))} of the time"]
         begin = p.valid.begin_ns
@@ -244,15 +394,7 @@ def conclusions(r: Review) -> list[str]:
             e = max((lo, hi), key=lambda v: abs(v.value_m))
             told.append(f"{axis} {mm(e.value_m)} \u00b1 {mm(e.std_m)} mm at {utc(e.utc_ns)[11:]}")
         out.append(f"{name}: furthest displacement (\u00b1 one sd) " + ", ".join(told) + ".")
-        if p.frequencies:
-            seen = ", ".join(number(f.freq_hz, 2 if f.freq_hz >= 10 else 3) for f in p.frequencies)
-            fused = sum(math.isfinite(f.fused_hz) for f in p.frequencies)
-            raw = sum(math.isfinite(f.gnss_hz) for f in p.frequencies)
-            told_raw = f", {raw} of the raw fixes" if p.gnss_spectrum is not None else ""
-            out.append(
-                f"{name}: dominating frequencies {seen} Hz in the accelerations; {fused} of {len(p.frequencies)} stand "
-                f"out of the fused displacement{told_raw}."
-            )
+        out += _frequencies(name, p)
         if p.agreement is not None and p.agreement.verdict != "CONTRADICTION":
             out.append(f"{name}: {p.agreement.text}.")
         elif p.agreement is not None and not in_doubt(p.agreement):
@@ -265,6 +407,19 @@ def conclusions(r: Review) -> list[str]:
             words_late = f", latency {1e3 * float(latency.mean[0]):.0f} ms in the mean" if latency.n else ""
             out.append(f"{name}: {x.stream.samples} fixes, {', '.join(told)}{words_late}.")
     return out
+
+
+def _frequencies(name: str, p: PointFigures) -> list[str]:
+    if not p.frequencies:
+        return []
+    seen = ", ".join(number(f.freq_hz, 2 if f.freq_hz >= 10 else 3) for f in p.frequencies)
+    told = f"{name}: dominating frequencies {seen} Hz in the accelerations"
+    if p.fused_spectrum is not None:
+        fused = sum(math.isfinite(f.fused_hz) for f in p.frequencies)
+        told += f"; {fused} of {len(p.frequencies)} stand out of the fused displacement"
+    if p.gnss_spectrum is not None:
+        told += f", {sum(math.isfinite(f.gnss_hz) for f in p.frequencies)} of the raw fixes"
+    return [f"{told}."]
 
 
 def in_doubt(a: Agreement) -> bool:
@@ -295,6 +450,11 @@ def findings(r: Review) -> list[Finding]:
             out.append(
                 Finding(0, f"{name}: the filter's sd is not honest: innovations\u00b2 are {worst:.1f} x the variance")
             )
+    for copy, home in sorted(r.copies.items()):
+        out.append(Finding(2, f"{copy.name} is a copy of data in {home.name}: counted once"))
+    if len(r.setups) > 1:
+        n = len(differences(r.setups))
+        out.append(Finding(2, f"the files were made with {len(r.setups)} configurations that differ in {n} settings"))
     for path, why in sorted(r.damaged.items()):
         out.append(Finding(1, f"{path.name} is damaged: {why}"))
     by_reason: dict[str, list[float]] = {}

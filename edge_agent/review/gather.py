@@ -9,9 +9,8 @@ Displacement counts where its mode is valid; what is not valid is in the mode's 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -20,14 +19,17 @@ import numpy as np
 import numpy.typing as npt
 
 from edge_agent import verify
-from edge_agent.messages import F64, I64, U8, VALID_MODES, Config, Mode, Quality, S, Verdict
+from edge_agent.messages import F64, I64, U8, VALID_MODES, Config, Estimate, Mode, Quality, S, Verdict
 from edge_agent.recording import topics
-from edge_agent.recording.reader import DamagedError, read_attachments, read_messages
+from edge_agent.recording.reader import DamagedError, read_messages
 from edge_agent.recording.writer import PART
-from edge_agent.replay import CONFIG_NAME, ReplayError
+from edge_agent.replay import ReplayError
 from edge_agent.review import spectra
-from edge_agent.review.agree import Agreement, agree
-from edge_agent.review.integrate import Differences, second_difference
+from edge_agent.review.agree import Agreement, agree, with_speeds
+from edge_agent.review.ahead import ahead, worth
+from edge_agent.review.checks import Apart, Checks, apart, check
+from edge_agent.review.estimates import Estimates
+from edge_agent.review.modal import Modal, Together, identify
 from edge_agent.review.series import (
     KEPT,
     Accelerometer,
@@ -43,8 +45,10 @@ from edge_agent.review.series import (
     pieces,
 )
 from edge_agent.review.smooth import Accelerations, plain
-from edge_agent.review.smoothed import Smoothed
+from edge_agent.review.smoothed import Smoothed, add_all
+from edge_agent.review.sources import Setup, copies, setups, together
 from edge_agent.review.splits import Split, split_fusion
+from edge_agent.review.wavelets import Wavelets, wavelets
 
 SPANS = 2000
 """Spans of an envelope that is drawn: one for each pixel of a wide plot."""
@@ -52,8 +56,8 @@ FINEST_NS = 20_000_000
 """Its shortest span; it doubles as the record grows."""
 SEGMENT_S = (8.0, 100.0)
 """Shortest and longest segment of a spectrum: a fifth of the record between them."""
-CHUNK = 6
-"""Segments that are averaged at a time."""
+CHUNK = 3
+"""Segments that are averaged at a time, a part of the record; two neighbouring parts are kept where they move most."""
 BUSY_S = (120.0, 600.0)
 """The busiest stretch that is kept of each point is so long: the longer one where fixes are rare,"""
 BUSY_FIXES = (100, 1200)
@@ -61,15 +65,17 @@ BUSY_FIXES = (100, 1200)
 TRUSTED = 0.6
 """Where the gate took so large a share of the fixes, what it refused is left out of the questions to the sensors; one
 that refuses more may be wrong itself, for example where the accelerometer contradicts."""
+SMOOTHED = 1 << 14
+"""Samples of the smoothed stream that are taken at a time."""
 CLOSE_NS = 6 * S
 """A close look reaches so far to both sides of an extreme."""
 PEAK_DB = 9.0
 """A frequency is told as dominating where accelerations stand so far above their floor."""
 MODES = 8
 """Frequencies told of one accelerometer at most, the highest above the floor."""
-TRACK_HZ, TRACK_PARTS, TRACK_REACH = 20.0, 200, 0.06
-"""Frequencies below this are tracked in time, in at most twice so many parts of the record, within so large a share of
-their mean."""
+TRACK_HZ, TRACK_PARTS, TRACK_REACH = 20.0, 96, 0.06
+"""Frequencies below this are tracked in time, in at most so many parts of the record, within so large a share of their
+mean."""
 SAME = 0.03
 """Peaks of two sensors are one frequency within this share,"""
 SAME_LINES = 1.5
@@ -117,6 +123,16 @@ class Moments:
         return np.asarray(np.sqrt(self.m2 / max(self.n, 1)))
 
 
+_VALID = np.isin(np.arange(256), VALID_MODES)
+"""Of each mode."""
+
+
+def _valid(mode: U8, t: I64, d: F64, sd: F64) -> tuple[I64, F64, F64]:
+    """Times (n,), displacements and their sd (n, 3) where the mode is valid; no copy where it is everywhere."""
+    valid = _VALID[mode]
+    return (t, d, sd) if valid.all() else (t[valid], d[valid], sd[valid])
+
+
 def _rising(t: I64) -> npt.NDArray[np.bool_]:
     """Times later than all before them: a file that is there twice must not turn time back."""
     good = np.ones(len(t), np.bool_)
@@ -127,24 +143,26 @@ def _rising(t: I64) -> npt.NDArray[np.bool_]:
 class Averaged:
     """Welch's density of a stream of any length, and the stretch of it that moved most."""
 
-    def __init__(self, segment_s: float) -> None:
-        self.segment_s = segment_s
+    def __init__(self, segment_s: float, *, keep: bool = False) -> None:
+        """`keep`: the stretch that moved most too, and what `track` needs."""
+        self.segment_s, self.keep = segment_s, keep
         self.rate_hz = 0.0
         self.busiest: spectra.Uniform | None = None
         self._power = -1.0
         self._total: F64 = np.zeros(0)
         self._freq: F64 = np.zeros(0)
         self._segments = 0
-        self._parts: list[tuple[int, F64]] = []  # middle, density below TRACK_HZ over all columns
+        self._parts: list[tuple[int, F64, int]] = []  # middle, density below TRACK_HZ over all columns, segments
         self._rows: list[tuple[I64, F64]] = []
         self._run = ""
+        self._before: tuple[I64, F64, float] | None = None  # the part before and its power
 
     def add(self, run: str, t_ns: I64, x: F64) -> None:
         if not len(t_ns):
             return
         if run != self._run:
             self.flush()
-            self._run = run
+            self._run, self._before = run, None
         self._rows.append((t_ns, x))
         if t_ns[-1] - self._rows[0][0][0] > CHUNK * self.segment_s * S:
             self.flush()
@@ -167,35 +185,49 @@ class Averaged:
             found = spectra.welch(u.x, u.rate_hz, max(8, round(self.segment_s * self.rate_hz)), valid=u.valid)
         except ValueError:  # no whole segment in it
             return
-        power = float(found.psd[1:].sum()) * found.segments
-        if power > self._power:
-            self._power, self.busiest = power, u
+        if self.keep:
+            self._keep(t, x, u, float(found.psd[1:].sum()) * found.segments)
         self._freq = found.freq_hz
         self._total = found.psd * found.segments + (self._total if self._segments else 0.0)
         self._segments += found.segments
+        if not self.keep:
+            return
         low = found.psd[found.freq_hz <= TRACK_HZ].sum(axis=1)
-        self._parts.append((int(t[0]) + int(t[-1] - t[0]) // 2, low))
+        self._parts.append((int(t[0]) + int(t[-1] - t[0]) // 2, low, found.segments))
         if len(self._parts) > 2 * TRACK_PARTS:
-            pairs = zip(self._parts[::2], self._parts[1::2], strict=False)
-            self._parts = [((a + b) // 2, 0.5 * (x + y)) for (a, x), (b, y) in pairs]
+            self._halve()
 
-    def track(self, freq_hz: Sequence[float]) -> tuple[I64, F64]:
-        """Where the peak near each frequency stood in each part of the record: middles (k,), Hz (k, f), NaN = none."""
-        out = np.full((len(self._parts), len(freq_hz)), np.nan)
-        step = float(self._freq[1]) if len(self._freq) > 1 else 1.0
-        for i, (_, psd) in enumerate(self._parts):
+    def _keep(self, t: I64, x: F64, u: spectra.Uniform, own: float) -> None:
+        power, stretch = own, u
+        if self._before is not None and 0 < t[0] - self._before[0][-1] < S:
+            power += self._before[2]
+            if power > self._power:
+                both = np.concatenate([self._before[0], t]), np.concatenate([self._before[1], x])
+                stretch = spectra.uniform(*both, self.rate_hz)
+        if power > self._power:
+            self._power, self.busiest = power, stretch
+        self._before = t, x, own
+
+    def _halve(self) -> None:
+        pairs = zip(self._parts[::2], self._parts[1::2], strict=False)
+        self._parts = [((a + b) // 2, (x * m + y * n) / (m + n), m + n) for (a, x, m), (b, y, n) in pairs]
+
+    def track(self, freq_hz: Sequence[float]) -> tuple[I64, F64, F64]:
+        """The mode near each frequency in each part of the record: middles (k,), Hz and its sd (k, f), NaN = none."""
+        while len(self._parts) > TRACK_PARTS:
+            self._halve()
+        out = np.full((2, len(self._parts), len(freq_hz)), np.nan)
+        for i, (_, psd, segments) in enumerate(self._parts):
+            lines = self._freq[: len(psd)]
             for j, f in enumerate(freq_hz):
-                half = max(4, round(TRACK_REACH * f / step))
-                lo, hi = round(f / step) - half, round(f / step) + half + 1
-                if lo < 1 or hi > len(psd):
+                apart = min((abs(f - g) for g in freq_hz if g != f), default=math.inf)
+                width = min(max(TRACK_REACH * f, 8.0 * float(lines[1])), 0.7 * apart)
+                if f > lines[-1]:
                     continue
-                db = np.log(np.maximum(psd[lo:hi], 1e-300))
-                k = int(np.argmax(db))
-                if 0 < k < len(db) - 1 and db[k] - float(np.median(db)) > 1.0:
-                    a, b, c = db[k - 1 : k + 2].tolist()
-                    bend = a - 2 * b + c
-                    out[i, j] = (lo + k + (0.5 * (a - c) / bend if bend < 0 else 0.0)) * step
-        return np.array([m for m, _ in self._parts], dtype=np.int64), out
+                mode = spectra.fit_density(lines, psd, segments, f, width, accelerations=True)
+                if abs(mode.freq_hz - f) <= TRACK_REACH * f and mode.std_freq_hz < TRACK_REACH * f:
+                    out[:, i, j] = mode.freq_hz, mode.std_freq_hz
+        return np.array([m for m, _, _ in self._parts], dtype=np.int64), out[0], out[1]
 
     def spectrum(self) -> spectra.Spectrum | None:
         """The average with its 95 % limits; None where there was no whole segment."""
@@ -226,13 +258,14 @@ class Frequency(NamedTuple):
 
 class Busy(NamedTuple):
     """Stretch in which a point moved most: fixes t_ns, z_m, std_m and which of them the gate took, accelerations t_ns,
-    xyz, fused t_ns, d, sd."""
+    xyz, fused t_ns, d, sd; velocity_mps (n, 2) of the fixes as the receiver told it."""
 
     utc_minus_ns: int
     fixes: tuple[I64, F64, F64]
     taken: npt.NDArray[np.bool_]
     accel: tuple[I64, F64]
     fused: tuple[I64, F64, F64]
+    velocity_mps: F64
 
 
 class _Keeper:
@@ -266,7 +299,7 @@ class _Keeper:
         if fixes is not None:
             good = (fixes.quality == Quality.FIXED) & np.isfinite(fixes.z_m).all(axis=1)
             self._count += len(fixes.t_ns)
-            self._rows["fixes"].append((fixes.t_ns[good], fixes.z_m[good], fixes.std_m[good]))
+            self._rows["fixes"].append((fixes.t_ns[good], fixes.z_m[good], fixes.std_m[good], fixes.velocity_mps[good]))
         judged = piece.judged.get(point)
         if judged is not None:
             self._refused.append(judged.t_ns[np.isin(judged.verdict, (Verdict.REJECTED, Verdict.OFFSET))])
@@ -274,10 +307,7 @@ class _Keeper:
             self._offset = int(accel.utc_ns[0] - accel.t_ns[0])
             self._rows["accel"].append((accel.t_ns, accel.xyz))
         if fused is not None:
-            valid = np.isin(fused.mode, VALID_MODES)
-            self._rows["fused"].append(
-                (fused.utc_ns[valid], fused.displacement_m[valid], fused.std_displacement_m[valid])
-            )
+            self._rows["fused"].append(_valid(fused.mode, fused.utc_ns, fused.displacement_m, fused.std_displacement_m))
 
     def close(self) -> None:
         rows = {k: [np.concatenate(c) for c in zip(*v, strict=True)] for k, v in self._rows.items() if v}
@@ -300,6 +330,7 @@ class _Keeper:
                 ~np.isin(fixes[0], refused),
                 (t, xyz),
                 (fused[0] - self._offset, fused[1], fused[2]),
+                fixes[3],
             )
 
 
@@ -329,12 +360,16 @@ class PointFigures:
         default_factory=lambda: (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
     )
     looks: dict[tuple[int, bool], Close] = field(default_factory=dict)  # axis, whether the largest
-    track: tuple[I64, F64] = field(default_factory=lambda: (np.zeros(0, np.int64), np.zeros((0, 0))))
+    track: tuple[I64, F64, F64] = field(
+        default_factory=lambda: (np.zeros(0, np.int64), np.zeros((0, 0)), np.zeros((0, 0)))
+    )
     close: list[Close] = field(default_factory=list)
     busy: Busy | None = None
     agreement: Agreement | None = None
     split: Split | None = None
-    differences: Differences | None = None
+    apart: Apart | None = None
+    checks: Checks | None = None
+    wavelets: Wavelets | None = None
     notes: list[str] = field(default_factory=list)
 
 
@@ -343,8 +378,7 @@ class Review:
     """Everything that the report tells. `damaged`: file -> what is wrong with it."""
 
     config: Config
-    config_text: str
-    configs: int  # different ones among the files
+    setups: list[Setup]  # the different configurations among the files
     verdict: verify.Verdict
     overview: Overview
     damaged: dict[Path, str]
@@ -355,6 +389,9 @@ class Review:
     latency: dict[str, Moments]
     places: dict[str, tuple[float, float, float]]  # receiver -> latitude, longitude, height
     rejects: dict[tuple[str, str], int]  # source, reason -> count
+    estimates: Estimates
+    modal: Modal | None = None
+    copies: dict[Path, Path] = field(default_factory=dict)  # left out: it holds nothing that the other does not
 
     @property
     def seconds(self) -> float:
@@ -376,10 +413,14 @@ def gather(inputs: Sequence[Path], progress: Callable[[str], None] | None = None
         told = "; ".join(f"{p}: {_short(p, why)}" for p, why in sorted(bad.items())) or "no recording there"
         raise ReplayError(told)
     config = configuration(files)
-    verdict = verify.verify([*files, *bad], lambda p: say(f"checking {p.name}"))
+    verdict = _checked([*files, *bad], lambda p: say(f"checking {p.name}"))
+    twice, looked = copies(verdict.files), verdict.files
+    if twice:
+        files = [p for p in files if p not in twice]
+        verdict = verify.judged([f for f in verdict.files if f.path not in twice], verdict.notes)
     damaged = {p: _short(p, why) for p, why in bad.items() if not p.name.endswith(PART)}
     unfinished = [p for p in bad if p.name.endswith(PART)]
-    for f in verdict.files:
+    for f in looked:
         if f.damage:
             damaged.setdefault(f.path, f.damage)
         elif f.state == "open" and f.path.name.endswith(PART):
@@ -389,22 +430,12 @@ def gather(inputs: Sequence[Path], progress: Callable[[str], None] | None = None
             damaged.setdefault(f.path, "cut off: its end is missing; what stands before is in the report")
     held = [f for f in verdict.files if f.messages]
     begin, end = min(f.begin_ns for f in held), max(f.end_ns for f in held)
-    texts = _configurations(files)
+    found = setups(files)
+    config = together(config, found)
     review = Review(
-        config,
-        texts[0] if texts else "",
-        len({hashlib.sha256(t.encode()).hexdigest() for t in texts}),
-        verdict,
-        Overview(),
-        damaged,
-        unfinished,
-        begin,
-        end,
-        {},
-        {},
-        {},
-        {},
-    )
+        config, found, verdict, Overview(), damaged, unfinished, begin, end, {}, {}, {}, {}, Estimates(config),
+        copies=twice,
+    )  # fmt: skip
     recorded_s = sum(f.end_ns - f.begin_ns for f in held) / S
     _walk(review, files, min(max(recorded_s / 5, SEGMENT_S[0]), SEGMENT_S[1]), smooth, say)
     review.overview.files.update(bad)
@@ -412,29 +443,33 @@ def gather(inputs: Sequence[Path], progress: Callable[[str], None] | None = None
         if damage and path not in damaged and path not in unfinished:
             damaged[path] = _short(path, damage)
     review.places = {name: place for name in config.receivers if (place := _place(files, name)) is not None}
-    for name, p in review.points.items():
-        say(f"{name}: looking closer")
+    names = list(review.points)
+    half = len(names) // 2 if worth(files) else 0
+    beside = ahead(_answered, [review.points[name] for name in names[:half]]) if half else iter(())
+    for name, p in zip(names[half:], _answered([review.points[name] for name in names[half:]]), strict=True):
+        say(f"{name}: looked closer")
+        review.points[name] = p
+    review.points |= dict(zip(names[:half], beside, strict=True))
+    return review
+
+
+def _checked(files: list[Path], progress: Callable[[Path], None]) -> verify.Verdict:
+    """`verify`, every second file by a second process."""
+    theirs = files[1::2] if worth(files) else []
+    beside = ahead(verify.looks, theirs) if theirs else iter(())
+    return verify.verify(files, progress, lambda p: next(beside) if p in theirs else verify.look(p))
+
+
+def _answered(points: list[PointFigures]) -> Iterator[PointFigures]:
+    """The points with what is asked of their busiest minutes."""
+    for p in points:
         p.close = _close_looks(p)
         _questions(p)
-    return review
+        yield p
 
 
 def _short(path: Path, why: str) -> str:
     return why.removeprefix(f"{path}: ")
-
-
-def _configurations(files: Sequence[Path]) -> list[str]:
-    """Texts of the configurations, each different one once, in the order of the files."""
-    out: list[str] = []
-    for path in files:
-        try:
-            for a in read_attachments(path):
-                text = a.data.decode(errors="replace")
-                if a.name == CONFIG_NAME and text not in out and len(out) < 100:
-                    out.append(text)
-        except (OSError, DamagedError):
-            continue
-    return out
 
 
 def _envelopes() -> tuple[Point, Receiver, Accelerometer]:
@@ -466,15 +501,17 @@ def _walk(review: Review, files: Sequence[Path], segment_s: float, smooth: bool,
         overview.points[name] = _envelopes()[0]
         keepers[name], fused[name], gnss[name] = _Keeper(), Averaged(segment_s), Averaged(segment_s)
         if smooth and p.receiver:
-            smoothers[name] = Smoothed(config, name)
+            smoothers[name] = Smoothed(config, name, block=SMOOTHED)
     for name in config.receivers:
         overview.receivers[name] = _envelopes()[1]
         review.latency[name] = Moments()
     for name in config.accelerometers:
         overview.accelerometers[name] = _envelopes()[2]
-        accel[name] = Averaged(segment_s)
+        accel[name] = Averaged(segment_s, keep=True)
     current = None
-    for piece in pieces(files, config, accelerations=bool(config.accelerometers)):
+    own = {path: s.config for s in review.setups for path in s.files}
+    moving = Together()
+    for piece in pieces(files, config, accelerations=bool(config.accelerometers), own=own):
         if piece.path != current:
             done += current.stat().st_size if current is not None else 0
             current = piece.path
@@ -486,17 +523,21 @@ def _walk(review: Review, files: Sequence[Path], segment_s: float, smooth: bool,
             p = review.points[name]
             _point(p, piece, name, fused[name], gnss[name])
             keepers[name].add(piece, name, p.receiver, p.accelerometer)
-            if name in smoothers:
-                _smooth(p, smoothers[name].add(piece))
+        for name, e, offset in add_all(smoothers, piece):
+            _smooth(review.points[name], e, offset)
         for name, x in piece.fixes.items():
             review.latency.setdefault(name, Moments()).add(x.latency_s[np.isfinite(x.latency_s)][:, None])
         for name, a in piece.accelerations.items():
-            accel.setdefault(name, Averaged(segment_s)).add(piece.run, a.utc_ns, a.xyz)
+            accel.setdefault(name, Averaged(segment_s, keep=True)).add(piece.run, a.utc_ns, a.xyz)
         overview.add(_for_overview(review, piece))
+        review.estimates.add(piece)
+        moving.add(piece)
+        del piece  # before the next one is there
     for name in names:
         p = review.points[name]
         if name in smoothers:
-            _smooth(p, smoothers[name].finish())
+            for e, offset in smoothers[name].finish():
+                _smooth(p, e, offset)
         keepers[name].close()
         p.busy = keepers[name].best
         p.fused_spectrum, p.gnss_spectrum = fused[name].spectrum(), gnss[name].spectrum()
@@ -504,6 +545,11 @@ def _walk(review: Review, files: Sequence[Path], segment_s: float, smooth: bool,
             p.accel_spectrum = accel[p.accelerometer].spectrum()
             p.frequencies = _frequencies(p, accel[p.accelerometer].busiest)
             p.track = accel[p.accelerometer].track([f.freq_hz for f in p.frequencies])
+    moving.close()
+    channels = moving.channels()
+    if channels is not None:
+        say("modes of all accelerometers together")
+        review.modal = identify(channels, _apart(f.freq_hz for p in review.points.values() for f in p.frequencies))
 
 
 def _for_overview(review: Review, piece: Piece) -> Piece:
@@ -519,20 +565,21 @@ def _for_overview(review: Review, piece: Piece) -> Piece:
             kept.append(h)
     fused = {}
     for name, f in piece.fused.items():
-        valid = np.isin(f.mode, VALID_MODES)[:, None]
-        fused[name] = dataclasses.replace(
-            f,
-            displacement_m=np.where(valid, f.displacement_m, np.nan),
-            std_displacement_m=np.where(valid, f.std_displacement_m, np.nan),
-        )
+        valid = _VALID[f.mode]
+        fused[name] = f
+        if not valid.all():
+            fused[name] = dataclasses.replace(
+                f,
+                displacement_m=np.where(valid[:, None], f.displacement_m, np.nan),
+                std_displacement_m=np.where(valid[:, None], f.std_displacement_m, np.nan),
+            )
     return dataclasses.replace(piece, happened=kept, fused=fused)
 
 
 def _point(p: PointFigures, piece: Piece, name: str, fused: Averaged, gnss: Averaged) -> None:
     f = piece.fused.get(name)
     if f is not None and len(f.utc_ns):
-        valid = np.isin(f.mode, VALID_MODES)
-        t, d, sd = f.utc_ns[valid], f.displacement_m[valid], f.std_displacement_m[valid]
+        t, d, sd = _valid(f.mode, f.utc_ns, f.displacement_m, f.std_displacement_m)
         p.valid.add(t)
         p.moments.add(d)
         p.std_m.add(sd)
@@ -603,14 +650,22 @@ def _mode_spells(p: PointFigures, t: I64, mode: U8) -> None:
             p.spells.append((begin, end, value))
 
 
-def _smooth(p: PointFigures, blocks: object) -> None:
-    for e, offset in blocks:  # type: ignore[attr-defined]
-        valid = np.isin(e.mode, VALID_MODES)
-        p.smoothed.add(e.t_ns[valid] + offset, e.displacement_m[valid])
-        p.smoothed_std_m.add(e.std_displacement_m[valid])
+def _smooth(p: PointFigures, e: Estimate, offset: int) -> None:
+    t, d, sd = _valid(e.mode, e.t_ns, e.displacement_m, e.std_displacement_m)
+    p.smoothed.add(t + offset, d)
+    p.smoothed_std_m.add(sd)
 
 
 # ---------------------------------------------------------------------------------------------------------- frequencies
+
+
+def _apart(freq_hz: Iterable[float]) -> list[float]:
+    """Frequencies of several points, each once."""
+    out: list[float] = []
+    for f in sorted(freq_hz):
+        if not out or f > (1.0 + SAME) * out[-1]:
+            out.append(f)
+    return out
 
 
 def _all_peaks(s: spectra.Spectrum, axis: int, above_db: float) -> list[spectra.Peak]:
@@ -719,7 +774,7 @@ def _questions(p: PointFigures) -> None:
     fixes = plain(t, z, np.where(np.isfinite(std) & (std > 0), std, 0.01))
     accel = Accelerations(*p.busy.accel)
     try:
-        p.agreement = agree(fixes, accel)
+        p.agreement = with_speeds(agree(fixes, accel), fixes, p.busy.velocity_mps[good], accel)
     except ValueError as e:
         p.notes.append(f"sensors not compared: {e}")
     try:
@@ -729,11 +784,15 @@ def _questions(p: PointFigures) -> None:
     t_f, d, _ = p.busy.fused
     good = _rising(t_f)
     t_f, d = t_f[good], d[good]
+    if p.split is not None:
+        p.apart = apart(p.split, t, (t_f, d))
     if len(t_f) > 200 and p.frequencies:
-        top = S / float(np.median(np.diff(t_f))) / 4
-        low = 0.5 * p.frequencies[0].freq_hz
-        if low < 0.5 * top:
-            p.differences = second_difference(t_f, d, accel, low, min(top, 1.5 * p.frequencies[-1].freq_hz))
+        low, high = 0.5 * p.frequencies[0].freq_hz, 1.5 * p.frequencies[-1].freq_hz
+        try:
+            p.checks = check(fixes, accel, (t_f, d), low, high)
+        except ValueError as e:
+            p.notes.append(f"not integrated: {e}")
+    p.wavelets = wavelets((t_f, d), (t, z), [f.freq_hz for f in p.frequencies], p.busy.utc_minus_ns)
 
 
 def modes_of(p: Point) -> dict[str, float]:

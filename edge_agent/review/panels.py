@@ -1,19 +1,16 @@
 """The panels of the report: each is a pure function from what was gathered to a piece of HTML, "" = nothing to tell.
 
-A new panel is a function here and a row in PANELS. Numbers come from `figures.as_json` where both tell the same.
+A new panel is a function and a row in `report.PANELS`. Numbers come from `figures.as_json` where both tell the same.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from html import escape
-from typing import NamedTuple
 
 import numpy as np
 
 from edge_agent.messages import F64, VALID_MODES, AccelFlag, Mode, Quality, S, Verdict
-from edge_agent.review import spectra
 from edge_agent.review.agree import CLOCK_S, Agreement
 from edge_agent.review.charts import (
     BLUE,
@@ -34,12 +31,13 @@ from edge_agent.review.charts import (
 )
 from edge_agent.review.gather import Extreme, PointFigures, Review, gaps_of, modes_of
 from edge_agent.review.series import Envelope, Stream
+from edge_agent.review.sources import differences
 
 MM = 1e3
 AXES = "xyz"
 LISTED = 60
 """Rows of a list at most; the JSON twin has more."""
-TRACKED = 4
+TRACKED = 3
 """Parts of the record at least, for a frequency to be drawn in time."""
 BAD_EVENTS = (
     "JUMP_OPEN", "JUMP_LEVEL", "DATUM", "REACQUIRE", "OUTAGE_END", "ACCEL_LOST", "ACCEL_GAP", "CONTRADICTION",
@@ -56,7 +54,18 @@ def mm(v: float, digits: int = 1) -> str:
 
 
 def number(v: float, digits: int) -> str:
-    return f"{v:.{digits}f}".replace("-", "\u2212") if math.isfinite(v) else "\u2013"
+    if not math.isfinite(v):
+        return "\u2013"
+    text = f"{v:.{digits}f}"
+    return text.replace("-", "\u2212") if float(text) else text.lstrip("-")
+
+
+def with_sd(v: float, sd: float, digits: int) -> str:
+    """v \u00b1 sd with so many digits, or as many more as show two figures of the sd; without sd the value alone."""
+    if not (math.isfinite(sd) and sd > 0):
+        return number(v, digits)
+    digits = max(digits, min(1 - math.floor(math.log10(sd)), digits + 2))
+    return f"{number(v, digits)} \u00b1 {number(sd, digits)}"
 
 
 def percent(share: float) -> str:
@@ -66,12 +75,12 @@ def percent(share: float) -> str:
     return f"{min(max(100 * share, 0.01), 99.99):.2f} %"
 
 
-def _far(e: Envelope, usual_ns: float) -> float:
+def break_of(e: Envelope, usual_ns: float) -> float:
     """Spans of an envelope further apart than this have a gap between them."""
     return max(1.5 * e.span_ns, 3.5 * usual_ns + e.span_ns)
 
 
-def _frame(r: Review) -> Scale:
+def period(r: Review) -> Scale:
     return time_scale(r.begin_ns, r.end_ns)
 
 
@@ -82,7 +91,7 @@ def availability(r: Review) -> str:
     """When each stream was there, in which mode or quality, and why not."""
     out = []
     for name, p in r.points.items():
-        plot = Plot(_frame(r), Scale(0, 1, ""), 34)
+        plot = Plot(period(r), Scale(0, 1, ""), 34)
         rows = [
             (float(a), float(b), MODE_COLOURS[Mode(m).name], f"{Mode(m).name} {utc(a)} {length((b - a) / S)}")
             for a, b, m in p.spells
@@ -94,7 +103,7 @@ def availability(r: Review) -> str:
     for name, receiver in r.overview.receivers.items():
         if not receiver.stream.samples:
             continue
-        plot = Plot(_frame(r), Scale(0, 1, ""), 34)
+        plot = Plot(period(r), Scale(0, 1, ""), 34)
         plot.spans(
             [
                 (float(a), float(b), _quality_colour(q), f"{quality_name(q)} {utc(a)} {length((b - a) / S)}")
@@ -107,7 +116,7 @@ def availability(r: Review) -> str:
     for name, sensor in r.overview.accelerometers.items():
         if not sensor.stream.samples:
             continue
-        plot = Plot(_frame(r), Scale(0, 1, ""), 34)
+        plot = Plot(period(r), Scale(0, 1, ""), 34)
         plot.spans([(float(a), float(b), BLUE, "accelerations") for a, b in _covered(sensor.stream)])
         plot.legend.append((BLUE, "box", "samples"))
         out.append(plot.html(f"{name}: accelerations", values=False))
@@ -199,7 +208,7 @@ def receivers(r: Review) -> str:
                 number(float(np.nanmax(age)), 1) if np.isfinite(age).any() else "\u2013",
             ]
         )
-        frame = _frame(r)
+        frame = period(r)
         t, lo, hi, _ = x.latency.spans()
         if len(t) and np.isfinite(lo).any():
             plot = Plot(frame, Scale(*limits(1e3 * lo, 1e3 * hi), "ms"), 110)
@@ -237,7 +246,7 @@ def displacement(r: Review) -> str:
         if not len(t) or not p.moments.n:
             out.append(f"<p>{escape(name)}: no valid displacement in these files.</p>")
             continue
-        far = _far(point.displacement, p.valid.usual_ns)
+        far = break_of(point.displacement, p.valid.usual_ns)
         position = r.overview.receivers.get(p.receiver)
         for axis in range(3):
             d0, d1 = MM * low[:, axis], MM * high[:, axis]
@@ -251,7 +260,7 @@ def displacement(r: Review) -> str:
                 if fine.sum() > 8:  # what most fixes span beside the estimate, not the wrong ones
                     shown += [np.quantile(z0[fine], (0.02, 0.98)), np.quantile(z1[fine], (0.02, 0.98))]
             y0, y1 = limits(*shown)
-            plot = Plot(_frame(r), Scale(y0, y1, "mm"), 200)
+            plot = Plot(period(r), Scale(y0, y1, "mm"), 200)
             if position is not None and position.stream.samples:
                 beyond = int(((z0 < y0) | (z1 > y1)).sum())
                 plot.bars(tz, z0, z1, "#a9a9a9", "raw GNSS" + (f" ({beyond} spans reach beyond)" if beyond else ""))
@@ -260,7 +269,7 @@ def displacement(r: Review) -> str:
             ts, s0, s1, _ = p.smoothed.spans()
             if len(ts):
                 plot.area(
-                    ts, MM * s0[:, axis], MM * s1[:, axis], _far(p.smoothed, p.valid.usual_ns), RED, "smoothed", 0.8
+                    ts, MM * s0[:, axis], MM * s1[:, axis], break_of(p.smoothed, p.valid.usual_ns), RED, "smoothed", 0.8
                 )
             out.append(plot.html(f"{name} {AXES[axis]}: displacement"))
         span = point.displacement.span_ns / S
@@ -302,12 +311,14 @@ def extremes(r: Review) -> str:
             if len(c.utc_ns) < 2:
                 continue
             d, sd = MM * c.displacement_m, 2 * MM * c.std_m
-            plot = Plot(time_scale(int(c.utc_ns[0]), int(c.utc_ns[-1])), Scale(*limits(d - sd, d + sd), "mm"), 150, 4)
+            plot = Plot(
+                time_scale(int(c.utc_ns[0]), int(c.utc_ns[-1])), Scale(*limits(d - sd, d + sd), "mm"), 150, 4, True
+            )
             far = 5.0 * float(np.median(np.diff(c.utc_ns)))
             plot.area(c.utc_ns, d - sd, d + sd, far, BLUE, "\u00b1 2 sd", 0.22)
             plot.line(c.utc_ns, d, BLUE, "live, fused, every sample", far)
             title = f"{name} {AXES[c.axis]}: around its furthest displacement, {utc(int(c.utc_ns[0]))[:10]}"
-            out.append(plot.html(title).replace('data-kind="time"', 'data-kind="own"'))
+            out.append(plot.html(title))
     if not rows:
         return ""
     head = [
@@ -343,7 +354,7 @@ def gate(r: Review) -> str:
         t, _, high, _ = point.ratio.spans()
         if len(t):
             y = np.log10(np.maximum(high[:, 0], 1e-3))
-            plot = Plot(_frame(r), Scale(-2.0, max(1.0, float(np.nanmax(y)) + 0.2), "ratio", log=True), 130)
+            plot = Plot(period(r), Scale(-2.0, max(1.0, float(np.nanmax(y)) + 0.2), "ratio", log=True), 130)
             plot.bars(t, y, y, GREY, "largest of each span")
             above = high[:, 0] > 1
             if above.any():
@@ -355,7 +366,7 @@ def gate(r: Review) -> str:
             for axis in range(3):
                 a, b = MM * low[:, axis], MM * high[:, axis]
                 sd = MM * float(p.std_residual_m[axis])
-                plot = Plot(_frame(r), Scale(*_most(a, b, sd), "mm"), 110)
+                plot = Plot(period(r), Scale(*_most(a, b, sd), "mm"), 110)
                 plot.bars(t, a, b, GREY, "fix less prediction")
                 if sd:
                     plot.level(2 * sd, BLUE, "\u00b1 2 sd as predicted, mean")
@@ -398,7 +409,7 @@ def events(r: Review) -> str:
         for h in sorted(first, key=lambda h: h.begin_ns)
     ]
     more = f" ({len(told)} in all, the JSON twin lists them)" if len(told) > LISTED else ""
-    plot = Plot(_frame(r), Scale(0, 1, ""), 34)
+    plot = Plot(period(r), Scale(0, 1, ""), 34)
     for h in first:
         bad = h.fault or h.kind in BAD_EVENTS
         colour = PURPLE if "TRIGGER" in h.kind or h.kind == "CLIP" else RED if bad else GREY
@@ -466,108 +477,16 @@ def sensors(r: Review) -> str:
         t, low, high, _ = a.xyz.spans()
         mean = np.nanmean((low + high) / 2, axis=0)
         low, high = low - mean, high - mean
-        plot = Plot(_frame(r), Scale(*limits(low, high), "m/s\u00b2"), 150)
+        plot = Plot(period(r), Scale(*limits(low, high), "m/s\u00b2"), 150)
         for axis, colour in enumerate((BLUE, ORANGE, GREEN)):
             shown = 0.75 if axis else 1.0
-            plot.area(t, low[:, axis], high[:, axis], _far(a.xyz, s.usual_ns), colour, AXES[axis], shown)
+            plot.area(t, low[:, axis], high[:, axis], break_of(a.xyz, s.usual_ns), colour, AXES[axis], shown)
         about = " / ".join(number(float(v), 3) for v in mean)
         out.append(plot.html(f"{name}: accelerations about {about} m/s\u00b2"))
     if not rows:
         return ""
     head = ["accelerometer", "samples", "rate [Hz]", "gaps", "flagged samples", "noticed"]
     return table(head, rows) + "".join(out)
-
-
-# -------------------------------------------------------------------------------------------------------------- spectra
-
-
-def frequencies(r: Review) -> str:
-    """Spectra of accelerations, fused and raw displacement, with the frequencies that stand out."""
-    out = []
-    for name, p in r.points.items():
-        rows = [
-            [
-                number(f.freq_hz, 3) + (f" \u00b1 {number(f.std_hz, 3)}" if math.isfinite(f.std_hz) else ""),
-                f"{100 * f.damping:.2f} \u00b1 {100 * f.std_damping:.2f}" if math.isfinite(f.damping) else "\u2013",
-                f.axes,
-                number(f.above_db, 0),
-                number(f.fused_hz, 3),
-                number(f.gnss_hz, 3),
-            ]
-            for f in p.frequencies
-        ]
-        if rows:
-            head = [
-                "accelerations [Hz]", "damping [%]", "axes", "above floor [dB]", "fused displacement [Hz]",
-                "raw GNSS [Hz]",
-            ]  # fmt: skip
-            out.append(f"<h3>{escape(name)}</h3>" + table(head, rows))
-        elif p.accel_spectrum is not None:
-            out.append(f"<h3>{escape(name)}</h3><p>No frequency stands out of the accelerations' floor.</p>")
-        if p.accel_spectrum is not None:
-            s = p.accel_spectrum
-            out.append(_density(f"{name}: accelerations", "(m/s\u00b2)\u00b2/Hz", [(s, "", "")], p))
-        parts = [(s, c, t) for s, c, t in ((p.gnss_spectrum, GREY, "raw GNSS"), (p.fused_spectrum, BLUE, "fused")) if s]
-        for axis in range(3):
-            if parts:
-                out.append(_density(f"{name} {AXES[axis]}: displacement", "mm\u00b2/Hz", parts, p, axis))
-        times, tracked = p.track
-        for i, f in enumerate(p.frequencies):
-            if len(times) >= TRACKED and np.isfinite(tracked[:, i]).sum() >= TRACKED:
-                y = tracked[:, i]
-                plot = Plot(_frame(r), Scale(*limits(y, room=0.3), "Hz"), 90)
-                plot.bars(times, y, y, BLUE, "peak of the accelerations in each part of the record")
-                out.append(plot.html(f"{name}: {number(f.freq_hz, 3)} Hz in time"))
-        used = [s for s in (p.accel_spectrum, p.fused_spectrum, p.gnss_spectrum) if s is not None]
-        if used:
-            text = ", ".join(f"{s.segments} segments of {length(1 / float(s.freq_hz[1]))}" for s in used[:1])
-            out.append(f'<p class="small">Welch, Hann window, {text}; shaded: 95 % confidence.</p>')
-    return "".join(out)
-
-
-def _density(
-    title: str,
-    unit: str,
-    parts: list[tuple[spectra.Spectrum, str, str]],
-    p: PointFigures,
-    axis: int | None = None,
-) -> str:
-    top = max(float(s.freq_hz[-1]) for s, _, _ in parts)
-    low = min(float(s.freq_hz[2]) for s, _, _ in parts)
-    curves: list[tuple[F64, F64, F64, F64, str, str]] = []
-    for s, colour, text in parts:
-        keep = s.freq_hz >= low
-        scale = 1.0 if axis is None else MM * MM
-        for i in range(3) if axis is None else (axis,):
-            f = np.log10(s.freq_hz[keep])
-            each = [np.log10(np.maximum(v[keep, i] * scale, 1e-18)) for v in (s.psd, s.low, s.high)]
-            paint = (BLUE, ORANGE, GREEN)[i] if axis is None else colour
-            curves.append((*_thinned(f, *each), paint, AXES[i] if axis is None else text))
-    y = np.concatenate([c[1] for c in curves])
-    plot = Plot(
-        Scale(math.log10(low), math.log10(top), "frequency [Hz]", log=True),
-        Scale(float(y.min()) - 0.3, float(y.max()) + 0.4, unit, log=True),
-        200,
-    )
-    for f, c, a, b, paint, text in curves:
-        plot.area(f, a, b, math.inf, paint, "", 0.15)
-        plot.line(f, c, paint, text)
-    for mode in p.frequencies:
-        if low < mode.freq_hz < top:
-            plot.mark(math.log10(mode.freq_hz), PURPLE, f"{mode.freq_hz:.3f} Hz")
-    if p.frequencies:
-        plot.legend.append((PURPLE, "line", "frequencies of the table"))
-    return plot.html(title)
-
-
-def _thinned(f: F64, y: F64, low: F64, high: F64, most: int = 900) -> tuple[F64, F64, F64, F64]:
-    """Fewer lines where they lie closer than a pixel, the highest of each bin: peaks stay."""
-    if len(f) <= most:
-        return f, y, low, high
-    cell = np.floor((f - f[0]) / (f[-1] - f[0]) * most).astype(np.int64)
-    starts = np.flatnonzero(np.diff(cell, prepend=-1))
-    at = np.array([a + int(np.argmax(y[a:b])) for a, b in zip(starts, [*starts[1:], len(f)], strict=True)])
-    return f[at], y[at], low[at], high[at]
 
 
 # ------------------------------------------------------------------------------------------------- what is asked closer
@@ -577,85 +496,6 @@ def offset_known(a: Agreement) -> bool:
     """Whether the offset may be told: where the sensors agree as they are, one far from zero is a chance hit."""
     o = a.offset
     return o.observable and (a.verdict == "CONTRADICTION" or abs(o.value_s) < max(CLOCK_S, 3 * o.std_s))
-
-
-def agreement(r: Review) -> str:
-    """Whether receiver and accelerometer tell of the same motion."""
-    rows, out = [], []
-    for name, p in r.points.items():
-        a = p.agreement
-        if a is None:
-            out += [f"<p>{escape(name)}: {escape(t)}</p>" for t in p.notes if "compared" in t]
-            continue
-        o, m = a.offset, a.mounting
-        known = offset_known(a)
-        offset = f"{1e3 * o.value_s:.1f} \u00b1 {1e3 * o.std_s:.1f} ms" if known else "not observable"
-        if not o.observable:
-            offset = escape(o.why)
-        yaw = f"{m.yaw_deg:.1f} \u00b1 {m.std_yaw_deg:.1f}\u00b0, {' '.join(m.axes)}" if m.observable else escape(m.why)
-        rows.append([escape(name), escape(a.verdict), escape(a.text), offset, yaw])
-    if rows:
-        head = ["point", "verdict", "", "add to the accelerometer's time", "yaw and axes"]
-        out.insert(0, table(head, rows))
-    for name, p in r.points.items():
-        d = p.differences
-        if d is None:
-            continue
-        cells = [
-            [AXES[i], number(float(d.correlation[i]), 3), number(float(d.gain[i]), 3), f"{d.rms_mps2[i]:.3g}",
-             f"{d.rms_difference_mps2[i]:.3g}"] for i in range(3)
-        ]  # fmt: skip
-        out.append(f"<h3>{escape(name)}: second difference of the fused displacement against the accelerations</h3>")
-        out.append(
-            table(["axis", "correlation", "gain", "rms [m/s\u00b2]", "rms of the difference [m/s\u00b2]"], cells, 4)
-        )
-    return "".join(out)
-
-
-def split(r: Review) -> str:
-    """Frequency-split fusion beside the filter, in the busiest seconds."""
-    out = []
-    for name, p in r.points.items():
-        s, busy = p.split, p.busy
-        if s is None or busy is None or len(s.t_ns) < 200:
-            continue
-        offset = busy.utc_minus_ns
-        speed = np.abs(np.diff(s.displacement_m, axis=0)).sum(axis=1)
-        taken = busy.fixes[0][busy.taken]
-        if not len(taken):
-            continue
-        i = np.clip(np.searchsorted(taken, s.t_ns[1:]), 1, len(taken) - 1)
-        speed[(taken[i] - taken[i - 1]) > 3 * S] = 0.0  # where fixes are missing it has nothing to split
-        n = min(len(s.t_ns), round(30 * S / float(np.median(np.diff(s.t_ns)))))
-        total = np.concatenate([[0.0], np.cumsum(speed)])
-        at = int(np.argmax(total[n - 1 :] - total[: len(total) - n + 1]))
-        k = slice(at, at + n)
-        t0, t1 = int(s.t_ns[k][0]), int(s.t_ns[k][-1])
-        t_f, d, _ = busy.fused
-        inside = (t_f >= t0) & (t_f <= t1)
-        if not inside.any():
-            continue
-        t_z, z, _ = busy.fixes
-        axis = int(np.argmax(np.std(s.displacement_m[k], axis=0)))
-        about = float(np.median(d[inside, axis])) - float(np.median(s.displacement_m[k, axis]))
-        near = (t_z >= t0) & (t_z <= t1)
-        shown = MM * np.concatenate([d[inside, axis], s.displacement_m[k, axis] + about])
-        plot = Plot(time_scale(t0 + offset, t1 + offset), Scale(*limits(shown), "mm"), 190)
-        near &= busy.taken
-        plot.bars(t_z[near] + offset, MM * z[near, axis], MM * z[near, axis], "#a9a9a9", "raw GNSS")
-        for curve, colour, text in ((s.g_type_m, ORANGE, "G-type"), (s.d_type_m, GREEN, "D-type")):
-            plot.line(s.t_ns[k] + offset, MM * (curve[k, axis] + about), colour, text)
-        far = 5.0 * float(np.median(np.diff(t_f)))
-        plot.line(t_f[inside] + offset, MM * d[inside, axis], BLUE, "live filter", far)
-        title = f"{name} {AXES[axis]}: split at {s.critical_hz:.3f} Hz, {utc(t0 + offset)[:10]}"
-        out.append(plot.html(title).replace('data-kind="time"', 'data-kind="own"'))
-    if out:
-        text = (
-            "G-type: fixes below half that frequency, accelerations above, integrated in windows; D-type: a forward "
-            "filter on high-passed accelerations. Both draw a line across missing fixes."
-        )
-        out.append(f'<p class="small">{text}</p>')
-    return "".join(out)
 
 
 # ------------------------------------------------------------------------------------------------------ place, settings
@@ -698,11 +538,24 @@ def place(r: Review) -> str:
 
 
 def settings(r: Review) -> str:
-    """The configuration as it is attached to the files."""
-    note = (
-        "" if r.configs < 2 else f"<p>{r.configs} different configurations are in these files; this is the first.</p>"
-    )
-    return note + f"<details open><summary>config.yaml</summary><pre>{escape(r.config_text)}</pre></details>"
+    """The configurations as they are attached to the files, and what differs between them."""
+    out = []
+    found = r.setups
+    if len(found) > 1:
+        head = ["setting", *(f"configuration {k + 1}" for k in range(min(len(found), 6)))]
+        told = [[escape(name), *(escape(v) or "\u2013" for v in values[:6])] for name, values in differences(found)]
+        whose = [
+            [str(k + 1), str(len(s.files)), escape(", ".join(p.name for p in s.files[:LISTED]))]
+            for k, s in enumerate(found)
+        ]
+        out.append(f"<p>These files were made with {len(found)} different configurations.</p>")
+        out.append(table(["configuration", "files", "which"], whose))
+        out.append("<h3>What differs</h3>" + table(head, told))
+    for k, s in enumerate(found[:3]):
+        title = "config.yaml" if len(found) == 1 else f"config.yaml, configuration {k + 1}"
+        shown = " open" if k == 0 else ""
+        out.append(f"<details{shown}><summary>{title}</summary><pre>{escape(s.text)}</pre></details>")
+    return "".join(out)
 
 
 def files(r: Review) -> str:
@@ -717,35 +570,12 @@ def files(r: Review) -> str:
                 [escape(f.path.name), state, utc(f.begin_ns) if f.messages else "", length((f.end_ns - f.begin_ns) / S),
                  f"{f.size / 1e6:.2f}"]
             )  # fmt: skip
+    for copy, home in sorted(r.copies.items()):
+        if copy not in r.damaged:
+            rows.append([escape(copy.name), "a copy: counted once", f"all of it is in {escape(home.name)}", "", ""])
     shown = rows[:200]
     more = f"<p>{len(rows) - len(shown)} more; the JSON twin lists them.</p>" if len(rows) > len(shown) else ""
-    return table(["file", "state", "begin [UTC]", "length", "size [MB]"], shown, 1) + more
+    return table(["file", "state", "begin [UTC], or what is wrong", "length", "size [MB]"], shown, 1) + more
 
 
-class Panel(NamedTuple):
-    """A section of the page."""
-
-    key: str
-    title: str
-    draw: Callable[[Review], str]
-
-
-PANELS = (
-    Panel("displacement", "Displacement", displacement),
-    Panel("extremes", "Extremes", extremes),
-    Panel("frequencies", "Spectra and frequencies", frequencies),
-    Panel("availability", "Availability and gaps", availability),
-    Panel("events", "Events", events),
-    Panel("gate", "Innovations and verdicts", gate),
-    Panel("receivers", "Fix quality and latency", receivers),
-    Panel("sensors", "Sensor health", sensors),
-    Panel("agreement", "Do the sensors agree?", agreement),
-    Panel("split", "Split by frequency, beside the filter", split),
-    Panel("losses", "Losses", losses),
-    Panel("place", "Where it stands", place),
-    Panel("files", "Files", files),
-    Panel("settings", "Configuration", settings),
-)
-"""The page from top to bottom."""
-
-__all__ = ["PANELS", "mm", "modes_of", "number", "percent"]
+__all__ = ["mm", "modes_of", "number", "percent"]

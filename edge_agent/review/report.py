@@ -11,14 +11,49 @@ from collections.abc import Callable, Sequence
 from html import escape
 from importlib.resources import files as package_files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from edge_agent.review import panels, panels_checks, panels_estimates, panels_modes
 from edge_agent.review.charts import length, utc
 from edge_agent.review.figures import as_json, availability_of, conclusions, findings
 from edge_agent.review.gather import Review, gather
-from edge_agent.review.panels import AXES, PANELS, mm, number, percent, quality_name
+from edge_agent.review.panels import AXES, mm, number, percent, quality_name
 
 LEVELS = ("doubt", "lost", "known")
+
+
+class Panel(NamedTuple):
+    """A section of the page."""
+
+    key: str
+    title: str
+    draw: Callable[[Review], str]
+
+
+PANELS = (
+    Panel("displacement", "Displacement", panels.displacement),
+    Panel("extremes", "Extremes", panels.extremes),
+    Panel("frequencies", "Spectra and frequencies", panels_modes.frequencies),
+    Panel("modes", "Modes of the structure", panels_modes.modes),
+    Panel("wavelets", "When it moved at which frequency", panels_modes.wavelets),
+    Panel("heading", "Heading", panels_estimates.headings),
+    Panel("availability", "Availability and gaps", panels.availability),
+    Panel("events", "Events", panels.events),
+    Panel("gate", "Innovations and verdicts", panels.gate),
+    Panel("honesty", "Is the stated accuracy honest?", panels_estimates.honesty),
+    Panel("noise", "Noise and bias", panels_estimates.noise),
+    Panel("clocks", "Clocks", panels_estimates.clocks),
+    Panel("receivers", "Fix quality and latency", panels.receivers),
+    Panel("sensors", "Sensor health", panels.sensors),
+    Panel("agreement", "Do the sensors agree?", panels_checks.agreement),
+    Panel("integration", "Integration and differences", panels_checks.integration),
+    Panel("split", "Split by frequency, beside the filter", panels_checks.split),
+    Panel("losses", "Losses", panels.losses),
+    Panel("place", "Where it stands", panels.place),
+    Panel("files", "Files", panels.files),
+    Panel("settings", "Configuration", panels.settings),
+)
+"""The page from top to bottom; a panel that returns "" has nothing to tell."""
 
 
 def page(r: Review) -> str:

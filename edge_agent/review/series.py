@@ -12,7 +12,7 @@ monotonic clock begins anew with each boot. Left out: mathematics (smooth, spect
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,14 +27,18 @@ from edge_agent.recording import topics
 from edge_agent.recording.reader import DamagedError, Stored, read_messages, read_metadata
 from edge_agent.recording.writer import RUN_METADATA
 from edge_agent.replay import ReplayError, in_order, recorded_config
+from edge_agent.review.ahead import ahead, worth
 from edge_agent.review.columns import groups
+from edge_agent.review.learned import Learned, learned
 from edge_agent.review.smooth import Accelerations, Fixes, plain
 from edge_agent.timebase import with_times
 
-PIECE_S = 60.0
-"""Seconds of a piece: 8 points at 250 Hz are 15 MB."""
-FRAMES_NS = S // 2
-"""Raw frames are decoded so much at a time: the same samples as live, their fitted times within the clock's own sd."""
+PIECE_S = 30.0
+"""Seconds of a piece, cut at whole multiples of UTC: 8 points at 250 Hz are 9 MB."""
+FRAMES_NS = 5 * S, S // 2
+"""Raw frames are decoded so much at a time where every sensor on the port counts its samples, and where one does not:
+the same samples as live, their fitted times within some us, far below the clock's own sd. Without a counter a loss
+shows only in the lateness of a dozen blocks, which must not take a minute."""
 SPANS = 4000
 """Spans of an envelope at most: two for each pixel of a wide screen."""
 KEPT = 5000
@@ -60,7 +64,8 @@ class Fused:
 @dataclass(frozen=True, slots=True)
 class Fixed:
     """Fixes of a receiver: utc_ns (n,), t_ns (n,) monotonic, z_m (n, 3) in structure axes about the point's zero, NaN
-    before there is a reference, std_m (n, 3) declared, quality, satellites (n,), latency_s, age_s (n,)."""
+    before there is a reference, std_m (n, 3) declared, quality, satellites (n,), latency_s, age_s (n,), velocity_mps
+    (n, 2) along x and y by the receiver's own word (VTG), NaN = none."""
 
     utc_ns: I64
     t_ns: I64
@@ -70,6 +75,7 @@ class Fixed:
     satellites: I64
     latency_s: F64
     age_s: F64
+    velocity_mps: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +131,9 @@ class Piece:
     happened: list[Happened]
     missing: int = 0
     damage: str = ""
+    noted: list[Stored] = field(default_factory=list)  # headings and ticks as they are
+    learned: list[Learned] = field(default_factory=list)  # at the head of a segment
+    bias: dict[str, tuple[I64, F64, F64]] = field(default_factory=dict)  # of a point: utc_ns, m/s2 and its sd (n, 3)
 
 
 def configuration(paths: Sequence[Path]) -> Config:
@@ -138,11 +147,15 @@ def configuration(paths: Sequence[Path]) -> Config:
 
 
 def files_of(inputs: Sequence[Path]) -> tuple[list[Path], dict[Path, str]]:
-    """Files among inputs (folders expanded) in order of time, and those that hold nothing with the reason."""
+    """Files among inputs (folders expanded) in order of time, each once, and those that hold nothing, with why."""
     good: list[Path] = []
     bad: dict[Path, str] = {}
+    seen: set[Path] = set()
     for path in inputs:
         for file in sorted(p for p in path.iterdir() if ".mcap" in p.suffixes) if path.is_dir() else [path]:
+            if file.resolve() in seen:
+                continue
+            seen.add(file.resolve())
             try:
                 if file.stat().st_size == 0:
                     bad[file] = "empty"
@@ -157,11 +170,39 @@ def files_of(inputs: Sequence[Path]) -> tuple[list[Path], dict[Path, str]]:
 
 
 def pieces(
-    files: Sequence[Path], config: Config, *, accelerations: bool = True, piece_s: float = PIECE_S
+    files: Sequence[Path],
+    config: Config,
+    *,
+    accelerations: bool = True,
+    piece_s: float = PIECE_S,
+    own: Mapping[Path, Config] | None = None,
 ) -> Iterator[Piece]:
-    """Walk over files in the given order."""
+    """Walk over files in the given order; `own`: configurations of files that have another. Large recordings are read
+    by a second process where there is one to be had, with the same result."""
+    args = list(files), config, accelerations, piece_s, dict(own or {})
+    return map(_widened, ahead(_pieces, *args) if worth(files) else _pieces(*args))
+
+
+def _widened(piece: Piece) -> Piece:
+    for name, f in piece.fused.items():
+        piece.fused[name] = Fused(
+            f.utc_ns,
+            f.displacement_m.astype(np.float64),
+            f.velocity_mps.astype(np.float64),
+            f.std_displacement_m.astype(np.float64),
+            f.std_velocity_mps.astype(np.float64),
+            f.mode,
+            f.flags,
+        )
+    return piece
+
+
+def _pieces(
+    files: list[Path], config: Config, accelerations: bool, piece_s: float, own: dict[Path, Config]
+) -> Iterator[Piece]:
+    """The same with the fused stream in float32, as it is recorded: less to hand over."""
     for path in files:
-        yield from _File(path, config, accelerations, round(piece_s * S)).walk()
+        yield from _File(path, own.get(path, config), accelerations, round(piece_s * S)).walk()
 
 
 def window(
@@ -203,6 +244,19 @@ def _together(rows: list[tuple[Any, ...]], count: int) -> list[Any]:
     return [np.concatenate(c) for c in zip(*rows, strict=True)]
 
 
+class _Wanted:
+    """The topics that pieces are made of."""
+
+    def __contains__(self, topic: object) -> bool:
+        name = str(topic)
+        return name.startswith((topics.RAW_PREFIX, "/events", "/faults")) or name.endswith(
+            ("/block", "/update", "/solution", "/heading")
+        )
+
+
+WANTED = _Wanted()
+
+
 class _File:
     """One file's walk: rows wait in lists until the piece is long enough."""
 
@@ -219,30 +273,38 @@ class _File:
         self.turn = np.array([self.axes.to_structure(e) for e in unit]).T
         self.zero = {name: np.zeros(3) for name in config.receivers}
         self.order: int | None = None
-        self.waiting: dict[str, list[tuple[CanFrames, int, int]]] = {}  # port -> frames, UTC - monotonic, their time
+        self.waiting: dict[str, list[tuple[CanFrames, int]]] = {}  # port -> frames, UTC - monotonic
+        counted = all(a.clock.counted for a in self.pipeline.accelerometers.values())
+        self.frames_ns = FRAMES_NS[0 if counted else 1]
+        self.cell = -1  # of the frames that wait
         self.first = True
         self._new()
 
     def _new(self) -> None:
-        self.begin_ns = -1
         self.rows: dict[tuple[str, str], list[tuple[Any, ...]]] = {}
         self.kept: dict[tuple[str, str], list[Stored]] = {}
         self.happened: list[Happened] = []
         self.missing = 0
+        self.noted: list[Stored] = []
+        self.learned: list[Learned] = []
 
     def walk(self) -> Iterator[Piece]:
         damage = ""
         try:
-            for stored in read_messages(self.path):
-                if self.begin_ns < 0:
-                    self.begin_ns = stored.log_ns
-                elif not 0 <= stored.log_ns - self.begin_ns < self.span_ns:
-                    yield self._piece("")
-                    self.begin_ns = stored.log_ns
+            span = -1
+            for stored in read_messages(self.path, WANTED):
+                cell = stored.log_ns // self.frames_ns
+                if cell != self.cell:  # not where a piece ends: that must not move the clocks
+                    self._frames()
+                    self.cell = cell
+                if stored.log_ns // self.span_ns != span:
+                    if span >= 0:
+                        yield self._piece("")
+                    span = stored.log_ns // self.span_ns
                 self._take(stored)
         except (OSError, ValueError) as e:  # what no longer decodes is damage too
             damage = str(e)
-        self._frames()  # at the end only: where a piece ends must not move the clocks
+        self._frames()
         yield self._piece(damage)
 
     def _take(self, s: Stored) -> None:
@@ -260,9 +322,12 @@ class _File:
                     self._keep("judged", point, s)
                 case ["", "gnss", receiver, "solution"]:
                     self._keep("fixes", receiver, s)
+                case ["", "fusion", _, "heading"]:
+                    self.noted.append(s)
                 case ["", "accel", name, "block"]:
                     b = topics.decode_accel_block(name, s.data)
                     self.decode_raw = False  # recorded at full rate: nothing to compute again
+                    self.waiting.clear()
                     offset = s.publish_ns - int(b.t_ns[0])
                     self._put("accel", name, b.t_ns + offset, b.t_ns, b.xyz, b.flags)
 
@@ -270,6 +335,7 @@ class _File:
         point = topics.decode_checkpoint(s.data)
         try:
             self.pipeline.load(point.state)
+            self.learned.append(learned(self.pipeline, s.publish_ns))
         except ValueError:  # another version's or other settings': codecs begin anew, which costs a moment
             self.pipeline = assemble.pipeline(self.config)
         for name in self.zero:
@@ -280,23 +346,23 @@ class _File:
         if self.order is not None and order > self.order + 1:
             self.missing += order - self.order - 1
         self.order = order
+        if s.schema == topics.TICK:
+            self.noted.append(s)
         if not self.decode_raw or s.schema != topics.CAN_FRAMES:
             return
         raw = topics.decode_raw(s.topic, s.schema, s.data)
         if isinstance(raw.payload, CanFrames):
             offset = s.log_ns - raw.t_ns  # the segment's map
             wait = self.waiting.setdefault(raw.source, [])
-            if wait and (wait[0][1] != offset or raw.t_ns - wait[0][2] > FRAMES_NS):
-                self._frames(raw.source)
+            if wait and wait[0][1] != offset:
+                self._frames()
                 wait = self.waiting.setdefault(raw.source, [])
-            wait.append((raw.payload, offset, raw.t_ns))
+            wait.append((raw.payload, offset))
 
-    def _frames(self, port: str | None = None) -> None:
-        """Decode the frames that wait, of one port or of all."""
-        for source in [port] if port is not None else list(self.waiting):
-            wait = self.waiting.pop(source, [])
-            if not wait:
-                continue
+    def _frames(self) -> None:
+        """Decode the frames that wait."""
+        waiting, self.waiting = self.waiting, {}
+        for source, wait in waiting.items():
             frames = _joined([w[0] for w in wait])
             for name, accelerometer in self.pipeline.accelerometers.items():
                 if accelerometer.settings.port != source:
@@ -321,9 +387,10 @@ class _File:
             c, utc = group.columns, publish[group.rows]
             t = c["monotonic_ns"][:, 0]
             if kind == "fused":
+                self._put("bias", name, utc, _three(c, "bias_mps2"), _three(c, "std_bias_mps2"))
                 after = c["t_offset_ns"]
                 three = (
-                    np.stack([c[f"{what}_{axis}_{unit}"].reshape(-1) for axis in "xyz"], axis=1).astype(np.float64)
+                    np.stack([c[f"{what}_{axis}_{unit}"].reshape(-1) for axis in "xyz"], axis=1)
                     for what, unit in (
                         ("displacement", "m"),
                         ("velocity", "mps"),
@@ -347,9 +414,11 @@ class _File:
                 z = enu @ self.turn.T - self.zero.get(name, np.zeros(3))
                 std = _three(c, "std_enu_m")
                 std = np.array([self.axes.std_to_structure((e, n, u)) for e, n, u in std.tolist()])
+                course, speed = np.radians(c["course_deg"][:, 0].astype(np.float64)), c["speed_mps"][:, 0]
+                velocity = np.stack([speed * np.sin(course), speed * np.cos(course)], axis=1) @ self.turn[:2, :2].T
                 self._put(
                     kind, name, utc, t, z, std, c["fix"][:, 0], c["satellites"][:, 0].astype(np.int64),
-                    c["latency_ns"][:, 0] / S, c["age_s"][:, 0].astype(np.float64),
+                    c["latency_ns"][:, 0] / S, c["age_s"][:, 0].astype(np.float64), velocity,
                 )  # fmt: skip
 
     def _event(self, s: Stored) -> None:
@@ -374,8 +443,10 @@ class _File:
             for (k, name), rows in self.rows.items():
                 if k == kind:
                     columns = [np.concatenate(c) for c in zip(*rows, strict=True)]
-                    order = np.argsort(columns[0], kind="stable")  # groups of messages came one after the other
-                    out[name] = [c[order] for c in columns]
+                    if (columns[0][1:] < columns[0][:-1]).any():  # groups of messages came one after the other
+                        order = np.argsort(columns[0], kind="stable")
+                        columns = [c[order] for c in columns]
+                    out[name] = columns
             return out
 
         piece = Piece(
@@ -389,6 +460,9 @@ class _File:
             self.happened,
             self.missing,
             damage,
+            self.noted,
+            self.learned,
+            {k: (c[0], c[1], c[2]) for k, c in joined("bias").items()},
         )
         self.first = False
         self._new()
@@ -436,14 +510,18 @@ class Envelope:
         if not len(utc_ns):
             return
         columns = values.reshape(len(utc_ns), -1)
-        count = np.ones(len(utc_ns), np.int64)
-        low, high = np.where(np.isnan(columns), np.inf, columns), np.where(np.isnan(columns), -np.inf, columns)
         key = utc_ns // self.span_ns
+        if (key[1:] < key[:-1]).any():
+            order = np.argsort(key, kind="stable")
+            key, columns = key[order], columns[order]
+        starts = np.flatnonzero(np.diff(key, prepend=key[0] - 1))
+        # fmin and fmax pass NaN over
+        low, high = np.fmin.reduceat(columns, starts, axis=0), np.fmax.reduceat(columns, starts, axis=0)
         self._merge(
-            np.concatenate([self._key, key]),
-            np.concatenate([self._low, low]),
-            np.concatenate([self._high, high]),
-            np.concatenate([self._count, count]),
+            np.concatenate([self._key, key[starts]]),
+            np.concatenate([self._low, np.where(np.isnan(low), np.inf, low)]),
+            np.concatenate([self._high, np.where(np.isnan(high), -np.inf, high)]),
+            np.concatenate([self._count, np.diff(starts, append=len(key))]),
         )
         while len(self._key) > self.most:
             self.span_ns *= 2

@@ -46,8 +46,10 @@ BLOW_S = 10.0
 """usual is what half of the intervals show in so long: shaking that lasts is no blow."""
 GAP_MEAN_S = 10.0
 """Across a gap the mean of the last accelerations of so long is held."""
-CHAPTER = 9_000
-"""Fixes of a chapter: a quarter of an hour at 10 Hz, some 25 MB with accelerations at 250 Hz."""
+PART = 1 << 13
+"""Samples between fixes that are computed at a time: what a processor's cache holds."""
+CHAPTER = 4_500
+"""Fixes of a chapter: seven minutes at 10 Hz, some 15 MB with accelerations at 250 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -387,40 +389,64 @@ def _span(s: Steps) -> Span:
 
 
 class Adjoint(NamedTuple):
-    """Behind each step, in terms of the state after it: r (L, N, M), n (L, N, N, M). Before the block's first step: r0
-    (N, M), n0 (N, N, M) and the map T (N, N, M) of the adjoint from the block's end to there."""
+    """Behind each step, in terms of the state after it: r (L, N, M), n (L, N, N, M)."""
 
     r: F64
     n: F64
+
+
+class Alone(NamedTuple):
+    """Blocks as if nothing came behind them: r0 (N, M), n0 (N, N, M) before the first step, and the map T (N, N, M) of
+    the adjoint from the block's end to there."""
+
     r0: F64
     n0: F64
     T: F64
+
+
+def _take_fix(f: Filtered, k: int, r: F64, n: F64) -> None:
+    """Bring the adjoint from behind the fix of step k to before it, in place: r <- H' nu/S + (I - K H)' r."""
+    K = f.K[k]
+    c = f.e[k] - (K * r).sum(axis=0)
+    r[D] += c
+    r[O] += c
+    nK = (n * K).sum(axis=1)
+    n[:, D] -= nK
+    n[:, O] -= nK
+    n[D] -= nK
+    n[O] -= nK
+    c = (K * nK).sum(axis=0) + f.w[k]
+    for i in (D, O):
+        n[i, D] += c
+        n[i, O] += c
 
 
 def _adjoint(f: Filtered, s: Steps, r: F64, n: F64) -> Adjoint:
     """Backward pass of every lane from r (N, M), n (N, N, M) behind the last step."""
     L, M = s.dt.shape
     rs, ns = np.empty((L, N, M)), np.empty((L, N, N, M))
-    T = np.zeros((N, N, M))
-    T[range(N), range(N)] = 1.0
     half = 0.5 * s.dt * s.dt
     r, n = r.copy(), n.copy()
     for k in range(L - 1, -1, -1):
         rs[k], ns[k] = r, n
-        K = f.K[k]
-        c = f.e[k] - (K * r).sum(axis=0)
-        r[D] += c
-        r[O] += c
-        nK = (n * K).sum(axis=1)
-        n[:, D] -= nK
-        n[:, O] -= nK
-        n[D] -= nK
-        n[O] -= nK
-        c = (K * nK).sum(axis=0) + f.w[k]
-        for i in (D, O):
-            n[i, D] += c
-            n[i, O] += c
-        KT = (K[:, None] * T).sum(axis=0)
+        _take_fix(f, k, r, n)
+        dt, hh, keep = s.dt[k], half[k], s.keep[k]
+        _back(r, dt, hh, keep)
+        _back(n, dt, hh, keep)
+        _back(n.swapaxes(0, 1), dt, hh, keep)
+    return Adjoint(rs, ns)
+
+
+def _alone(f: Filtered, s: Steps) -> Alone:
+    """The same from nothing, and the map: what is linear in what lies behind."""
+    L, M = s.dt.shape
+    T = np.zeros((N, N, M))
+    T[range(N), range(N)] = 1.0
+    half = 0.5 * s.dt * s.dt
+    r, n = np.zeros((N, M)), np.zeros((N, N, M))
+    for k in range(L - 1, -1, -1):
+        _take_fix(f, k, r, n)
+        KT = (f.K[k][:, None] * T).sum(axis=0)
         T[D] -= KT
         T[O] -= KT
         dt, hh, keep = s.dt[k], half[k], s.keep[k]
@@ -428,7 +454,7 @@ def _adjoint(f: Filtered, s: Steps, r: F64, n: F64) -> Adjoint:
         _back(n, dt, hh, keep)
         _back(n.swapaxes(0, 1), dt, hh, keep)
         _back(T, dt, hh, keep)
-    return Adjoint(rs, ns, r, n, T)
+    return Alone(r, n, T)
 
 
 # ------------------------------------------------------------------------------------------------------------ chapters
@@ -558,11 +584,9 @@ def _nothing() -> _Behind:
     return _Behind(np.zeros((N, 3)), np.zeros((N, N, 3)))
 
 
-def _backward(c: _Chapter, behind: _Behind) -> tuple[Adjoint, _Behind, F64]:
-    """Adjoint of all steps in lanes; that at the chapter's start; the map T (N, N, 3) from its end to there."""
-    _, _, K = c.lanes
-    M = 3 * K
-    alone = _adjoint(c.filtered, c.steps, np.zeros((N, M)), np.zeros((N, N, M)))
+def _joined(alone: Alone, K: int, behind: _Behind) -> tuple[list[F64], list[F64], F64]:
+    """Adjoints behind each of K blocks, the last block's first, that before the first at the end; and the map T
+    (N, N, 3) from the chapter's end to its start."""
     r, n = [behind.r], [behind.n]
     T = np.broadcast_to(np.eye(N)[:, :, None], (N, N, 3))
     for k in range(K - 1, -1, -1):
@@ -571,14 +595,22 @@ def _backward(c: _Chapter, behind: _Behind) -> tuple[Adjoint, _Behind, F64]:
         r.append(alone.r0[:, part] + _mul(t, r[-1][:, None])[:, 0])
         n.append(alone.n0[..., part] + _mul(_mul(t, n[-1]), t.swapaxes(0, 1)))
         T = _mul(t, T)
+    return r, n, T
+
+
+def _backward(c: _Chapter, alone: Alone, behind: _Behind) -> tuple[Adjoint, _Behind]:
+    """Adjoint of all steps in lanes; that at the chapter's start."""
+    r, n, _ = _joined(alone, c.lanes[2], behind)
     before = _Behind(r.pop(), n.pop())
-    full = _adjoint(c.filtered, c.steps, np.concatenate(r[::-1], axis=-1), np.concatenate(n[::-1], axis=-1))
-    return full, before, T
+    return _adjoint(c.filtered, c.steps, np.concatenate(r[::-1], axis=-1), np.concatenate(n[::-1], axis=-1)), before
 
 
 def _mul(a: F64, b: F64) -> F64:
     """Matrix product a b of stacks (..., i, j, lanes) and (..., j, k, lanes)."""
-    return np.asarray((a[..., :, :, None, :] * b[..., None, :, :, :]).sum(axis=-3))
+    out = a[..., :, 0, None, :] * b[..., None, 0, :, :]
+    for k in range(1, a.shape[-2]):
+        out += a[..., :, k, None, :] * b[..., None, k, :, :]
+    return np.asarray(out)
 
 
 # ----------------------------------------------------------------------------------------------------------- the result
@@ -610,7 +642,9 @@ def _finish(
 ) -> Smooth:
     f = c.filtered
     x_s = f.x + _mul(f.P, adjoint.r[:, :, None])[:, :, 0]
-    P_s = f.P - _mul(_mul(f.P, adjoint.n), f.P)
+    P_s = np.empty_like(f.P)
+    for i in range(len(P_s)):  # one by one: small arrays stay in the cache
+        P_s[i] = f.P[i] - _mul(_mul(f.P[i], adjoint.n[i]), f.P[i])
     P0 = c.start.P
     x = c.line(c.start.x + _mul(P0, before.r[:, None])[:, 0], x_s)  # (N, 3, n + 1)
     P = c.line(P0 - _mul(_mul(P0, before.n), P0), P_s)
@@ -624,28 +658,30 @@ def _finish(
     poly = [xs[D], xs[V], 0.5 * (q * rv - xs[B]), (q * rd + qb * rb) / -6.0, qb * rv / -24.0, qb * rd / 120.0]
     t = inc.t_ns
     tau = np.asarray((t - c.node_ns[inc.after]) * NS, dtype=np.float64)
-    d, v = np.empty((3, len(tau))), np.zeros((3, len(tau)))
+    m = len(tau)
+    d, v = np.empty((3, m + last)), np.zeros((3, m + last))
     for axis in range(3):
-        y, slope = poly[-1][axis].take(inc.after), v[axis]
-        for p in poly[-2::-1]:
-            slope *= tau
-            slope += y
-            y *= tau
-            y += p[axis].take(inc.after)
-        d[axis] = y
-    d += inc.d
-    v += inc.v
+        for k in _cached(m):
+            at, after, slope = tau[k], inc.after[k], v[axis, k]
+            y = poly[-1][axis].take(after)
+            for p in poly[-2::-1]:
+                slope *= at
+                slope += y
+                y *= at
+                y += p[axis].take(after)
+            np.add(y, inc.d[axis, k], out=d[axis, k])
+            slope += inc.v[axis, k]
     sd_d = sd_v = np.zeros((3, 0))
     if std:
         P_f, n = c.line(P0, f.P)[..., :-1], c.line(before.n, adjoint.n)[..., :-1]
         jumps = bool(c.level or c.start.level or n[O].any())
-        sd_d, sd_v = _spread(P_f, n, q, qb, tau, inc.after, (D, V, B, O) if jumps else (D, V, B))
+        sd_d, sd_v = np.empty((3, m + last)), np.empty((3, m + last))
+        _spread(P_f, n, q, qb, tau, inc.after, (D, V, B, O) if jumps else (D, V, B), (sd_d, sd_v))
     if last:
         t = np.concatenate([t, c.node_ns[-1:]])
-        d, v = (np.concatenate([m, x[i, :, -1:]], axis=1) for m, i in ((d, D), (v, V)))
+        d[:, m], v[:, m] = x[D, :, -1], x[V, :, -1]
         if std:
-            ends = (np.sqrt(np.maximum(P[i, i, :, -1:], 0.0)) for i in (D, V))
-            sd_d, sd_v = (np.concatenate([m, e], axis=1) for m, e in zip((sd_d, sd_v), ends, strict=True))
+            sd_d[:, m], sd_v[:, m] = (np.sqrt(np.maximum(P[i, i, :, -1], 0.0)) for i in (D, V))
     used = f.w > 0
     w = np.where(used, f.w, 1.0)
     each = np.where(used, np.log(w) - f.e * f.e / w - math.log(2 * math.pi), 0.0)
@@ -662,17 +698,22 @@ def _slope(p: Poly) -> Poly:
     return [None if c is None else c * float(i) for i, c in enumerate(p)][1:]
 
 
-def _along(p: Poly, tau: F64, after: I64) -> F64:
-    """The polynomial at tau (m,) behind node `after` (m,): (3, m)."""
-    out = np.empty((3, len(tau)))
+def _cached(m: int) -> Iterator[slice]:
+    """Samples 0..m-1 in parts so short that all that is computed of one stays in the processor's cache."""
+    return (slice(lo, min(lo + PART, m)) for lo in range(0, m, PART))
+
+
+def _roots_along(p: Poly, tau: F64, after: I64, out: F64) -> None:
+    """Square root of the polynomial at tau (m,) behind node `after` (m,), into out (3, m or more)."""
     for axis in range(3):
-        y = np.zeros(len(tau))
-        for c in p[::-1]:
-            y *= tau
-            if c is not None:
-                y += c[axis].take(after)
-        out[axis] = y
-    return out
+        for k in _cached(len(tau)):
+            at, node, y = tau[k], after[k], out[axis, k]
+            y[:] = 0.0
+            for c in p[::-1]:
+                y *= at
+                if c is not None:
+                    y += c[axis].take(node)
+            np.sqrt(np.maximum(y, 0.0, out=y), out=y)
 
 
 def _add_product(total: Poly, a: Poly, b: Poly, factor: F64) -> None:
@@ -689,8 +730,10 @@ def _add_product(total: Poly, a: Poly, b: Poly, factor: F64) -> None:
                 total[i + j] = term if old is None else old + term
 
 
-def _spread(P: F64, n: F64, q: F64, qb: F64, tau: F64, after: I64, states: tuple[int, ...]) -> tuple[F64, F64]:
-    """sd of d and v (3, m) between nodes: P_s(tau) = P(tau) - y N y', y = [F P + Q F(-tau)'] of its row.
+def _spread(
+    P: F64, n: F64, q: F64, qb: F64, tau: F64, after: I64, states: tuple[int, ...], out: tuple[F64, F64]
+) -> None:
+    """sd of d and v (3, m), into `out`, between nodes: P_s(tau) = P(tau) - y N y', y = [F P + Q F(-tau)'] of its row.
 
     P, n (N, N, 3, n). Terms of the variance, a polynomial of degree 10, that nowhere reach 1e-5 of it are left out."""
     rows: dict[int, Poly] = {
@@ -704,8 +747,7 @@ def _spread(P: F64, n: F64, q: F64, qb: F64, tau: F64, after: I64, states: tuple
     slopes = {i: _slope(row) for i, row in rows.items()}
     longest = np.zeros(q.shape[1])
     np.maximum.at(longest, after, tau)
-    out = []
-    for lines, total in ((rows, own), (slopes, speed)):
+    for lines, total, sd in ((rows, own, out[0]), (slopes, speed, out[1])):
         for i in states:
             for j in states:
                 if j >= i:
@@ -717,8 +759,7 @@ def _spread(P: F64, n: F64, q: F64, qb: F64, tau: F64, after: I64, states: tuple
                 break
             total.pop()
             power = longest ** (len(total) - 1)
-        out.append(np.sqrt(np.maximum(_along(total, tau, after), 0.0)))
-    return out[0], out[1]
+        _roots_along(total, tau, after, sd)
 
 
 def smooth(fixes: Fixes, accel: Accelerations, noise: Noise, *, std: bool = True, ahead: bool = True) -> Smooth:
@@ -731,10 +772,10 @@ def smooth(fixes: Fixes, accel: Accelerations, noise: Noise, *, std: bool = True
     reference = _reference(accel)
     chapter = _forward(begin(fixes), fixes.part(1, len(fixes)), accel, reference, noise)
     if ahead:
-        adjoint, before, _ = _backward(chapter, _nothing())
+        adjoint, before = _backward(chapter, _alone(chapter.filtered, chapter.steps), _nothing())
     else:
         f, before = chapter.filtered, _nothing()
-        adjoint = Adjoint(np.zeros_like(f.x), np.zeros_like(f.P), f.x[0], f.P[0], f.P[0])
+        adjoint = Adjoint(np.zeros_like(f.x), np.zeros_like(f.P))
     return _finish(chapter, adjoint, before, reference, std, True, 0.0)
 
 
@@ -758,7 +799,7 @@ class Smoother:
         self.noise, self.std = noise, std
         self._state: State | None = None
         self._reference: F64 = np.zeros(3)
-        self._waiting: _Chapter | None = None
+        self._waiting: tuple[_Chapter, Alone] | None = None
 
     def add(self, fixes: Fixes, accel: Accelerations) -> Iterator[Smooth]:
         """Take the next chapter; yield the one before."""
@@ -770,19 +811,21 @@ class Smoother:
             return
         new = _forward(self._state, fixes, accel, self._reference, self.noise)
         self._state = new.end()
+        alone = _alone(new.filtered, new.steps)
         if self._waiting is not None:
-            _, behind, T = _backward(new, _nothing())
-            yield self._out(self._waiting, behind, False, _open_end(new, T, behind))
-        self._waiting = new
+            r, n, T = _joined(alone, new.lanes[2], _nothing())
+            behind = _Behind(r[-1], n[-1])
+            yield self._out(*self._waiting, behind, False, _open_end(new, T, behind))
+        self._waiting = new, alone
 
     def finish(self) -> Iterator[Smooth]:
         """Yield what is left; the smoother is then as new."""
         if self._waiting is not None:
-            yield self._out(self._waiting, _nothing(), True, 0.0)
+            yield self._out(*self._waiting, _nothing(), True, 0.0)
         self._state = self._waiting = None
 
-    def _out(self, c: _Chapter, behind: _Behind, last: bool, open_end: float) -> Smooth:
-        adjoint, before, _ = _backward(c, behind)
+    def _out(self, c: _Chapter, alone: Alone, behind: _Behind, last: bool, open_end: float) -> Smooth:
+        adjoint, before = _backward(c, alone, behind)
         return _finish(c, adjoint, before, self._reference, self.std, last, open_end)
 
 

@@ -2,14 +2,15 @@
 
 The gate's recorded verdicts decide what is used: ACCEPTED as it is, OFFSET on a level of its own that is estimated
 beside (a new one with every JUMP_OPEN and JUMP_LEVEL), the rest not at all; float fixes wander and are left out. DATUM
-and REACQUIRE move the displacement itself. The declared sd is that which the filter used. Noise of each chapter is its
-own maximum likelihood.
+and REACQUIRE move the displacement itself. The declared sd is that which the filter used. Noise is found by
+maximum likelihood in the chapters, anew every quarter of an hour at 10 Hz; the sd of the fixes is left as it is where
+`fusion.r_least` and `r_most` are both 1.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from edge_agent.recording import topics
 from edge_agent.recording.reader import read_attachments, read_messages, read_metadata
 from edge_agent.recording.writer import PART, RUN_METADATA, SegmentWriter
 from edge_agent.replay import FINAL
-from edge_agent.review.likelihood import fit
+from edge_agent.review.likelihood import Fit, fit, fits
 from edge_agent.review.series import Piece, configuration, pieces
 from edge_agent.review.smooth import CHAPTER, NO_ACCELERATIONS, Accelerations, Fixes, Noise, Smooth, Smoother
 
@@ -33,13 +34,21 @@ HELD = 8192
 """Blocks that wait for points that are behind, at most: a receiver that is silent for an hour must not fill memory."""
 LEAST = 20
 """Fixes of a chapter at least; fewer are not smoothed."""
+NOISE = 1000
+"""Fixes from which noise is found."""
+NOISE_EVERY = 9_000
+"""It is found anew in the first chapter behind so many fixes."""
+SIDE_BY_SIDE = 2
+"""Chapters of several points whose noise is found at the same time: 30 MB each."""
+_USED = frozenset((int(Verdict.ACCEPTED), int(Verdict.OFFSET)))
+_NO_FIX = np.zeros(3), False, 0
 
 
 @dataclass
 class _Waiting:
     """What a chapter is made of, not yet smoothed. Fixes and their verdicts come in records of their own."""
 
-    z: dict[int, tuple[F64, int, int]] = field(default_factory=dict)  # t_ns -> z, quality, UTC - monotonic
+    z: dict[int, tuple[F64, bool, int]] = field(default_factory=dict)  # t_ns -> z, whether it is one, UTC - monotonic
     rows: list[tuple[int, F64, F64, int, bool, int]] = field(default_factory=list)  # t, z, std, level, step, offset
     accel: list[tuple[I64, F64]] = field(default_factory=list)
     jumps: list[int] = field(default_factory=list)  # t_ns of every new level
@@ -50,19 +59,33 @@ class _Waiting:
 class Smoothed:
     """Feed pieces of one point in order; each call yields blocks with their UTC - monotonic [ns]."""
 
-    def __init__(self, config: Config, point: str, *, noise: Noise | None = None, chapter: int = CHAPTER) -> None:
+    def __init__(
+        self, config: Config, point: str, *, noise: Noise | None = None, chapter: int = CHAPTER, block: int = BLOCK
+    ) -> None:
         settings = config.points[point]
         self.point, self.receiver, self.accelerometer = point, settings.receiver, settings.accelerometer
         self.fusion = config.fusion
-        self.noise, self.chapter = noise, chapter
+        # the configuration may insist on the declared variances
+        self.fixed_r = 1.0 if config.fusion.r_least == config.fusion.r_most == 1.0 else None
+        self.noise, self.chapter, self.block = noise, chapter, block
         self._smoother: Smoother | None = None
         self._wait = _Waiting()
+        self._r = np.ones(3)  # factor on the declared variance that belongs to the smoother's noise
+        self._since = 0  # fixes since noise was found
         self._run = ""
         self._last_ns = -(1 << 62)
         self._offsets: list[tuple[int, int]] = []  # t_ns, UTC - monotonic of fixes not yet given out
 
     def add(self, piece: Piece) -> Iterator[tuple[Estimate, int]]:
-        if piece.run != self._run:
+        yield from self._take(piece)
+        if self._full:
+            yield from self._close(*self._chapter(self.chapter))
+
+    def _take(self, piece: Piece) -> Iterator[tuple[Estimate, int]]:
+        """Take in what a piece holds; yields what ends with it."""
+        accel = piece.accelerations.get(self.accelerometer or "")
+        back = accel is not None and int(accel.t_ns[0]) <= self._wait.accel_to_ns  # another record of the same time
+        if piece.run != self._run or back:
             yield from self.finish()
             self._run = piece.run
         w = self._wait
@@ -74,19 +97,18 @@ class Smoothed:
                     w.steps.add(h.t_ns)
         fixes = piece.fixes.get(self.receiver or "")
         if fixes is not None:
-            for i, t in enumerate(fixes.t_ns.tolist()):
-                w.z[t] = fixes.z_m[i], int(fixes.quality[i]), int(fixes.utc_ns[i]) - t
-        accel = piece.accelerations.get(self.accelerometer or "")
+            good = np.isfinite(fixes.z_m).all(axis=1) & (fixes.quality != Quality.FLOAT)
+            offset_ns = (fixes.utc_ns - fixes.t_ns).tolist()
+            for t, z, usable, offset in zip(fixes.t_ns.tolist(), fixes.z_m, good.tolist(), offset_ns, strict=True):
+                w.z[t] = z, usable, offset
         if accel is not None:
             w.accel.append((accel.t_ns, accel.xyz))
             w.accel_to_ns = int(accel.t_ns[-1])
         judged = piece.judged.get(self.point)
         if judged is not None:
-            for i, t in enumerate(judged.t_ns.tolist()):
-                z, quality, offset = w.z.pop(t, (np.zeros(0), 0, 0))
-                verdict = int(judged.verdict[i])
-                usable = verdict in (Verdict.ACCEPTED, Verdict.OFFSET) and quality != Quality.FLOAT
-                if not usable or not len(z) or not np.isfinite(z).all():
+            for t, verdict, std in zip(judged.t_ns.tolist(), judged.verdict.tolist(), judged.std_m, strict=True):
+                z, usable, offset = w.z.pop(t, _NO_FIX)
+                if not usable or verdict not in _USED:
                     continue
                 if t - self._last_ns > CUT_NS and w.rows:
                     yield from self.finish(keep=True)
@@ -96,17 +118,21 @@ class Smoothed:
                 level = 0
                 if verdict == Verdict.OFFSET:
                     level = 1 + sum(1 for j in w.jumps if j <= t)
-                w.rows.append((t, z, judged.std_m[i], level, t in w.steps, offset))
+                w.rows.append((t, z, std, level, t in w.steps, offset))
             for t in [t for t in w.z if t < self._last_ns - 60 * S]:
                 del w.z[t]
-        if len(w.rows) > self.chapter and (self.accelerometer is None or w.accel_to_ns > w.rows[self.chapter - 1][0]):
-            yield from self._close(self.chapter)
+
+    @property
+    def _full(self) -> bool:
+        """Whether a chapter waits, with the accelerations that cover it."""
+        w, n = self._wait, self.chapter
+        return len(w.rows) > n and (self.accelerometer is None or w.accel_to_ns > w.rows[n - 1][0])
 
     def finish(self, *, keep: bool = False) -> Iterator[tuple[Estimate, int]]:
         """What is left, at the end of a run or before a long outage (`keep`: verdicts that wait stay)."""
         w = self._wait
         if w.rows:
-            yield from self._close(len(w.rows))
+            yield from self._close(*self._chapter(len(w.rows)))
         if self._smoother is not None:
             for s in self._smoother.finish():
                 yield from self._blocks(s)
@@ -119,12 +145,10 @@ class Smoothed:
         else:
             self._last_ns = -(1 << 62)
 
-    def _close(self, n: int) -> Iterator[tuple[Estimate, int]]:
-        """Filter the first n fixes as a chapter."""
+    def _chapter(self, n: int) -> tuple[Fixes, Accelerations]:
+        """Take the first n fixes that wait as a chapter, with the accelerations so far."""
         w = self._wait
         rows, w.rows = w.rows[:n], w.rows[n:]
-        if self._smoother is None and len(rows) < LEAST:
-            return
         t, z, std, level, step, offset = zip(*rows, strict=True)
         fixes = Fixes(
             np.array(t, np.int64), np.array(z), np.array(std), np.array(level, np.int64), np.array(step, np.bool_)
@@ -137,22 +161,38 @@ class Smoothed:
             accel = Accelerations(all_t[rising], all_a[rising])
             kept = accel.t_ns >= fixes.t_ns[-1] - 12 * S  # a mean of 10 s may be asked for, and the last sample
             w.accel = [(accel.t_ns[kept], accel.xyz[kept])]
-        noise = self.noise
-        if noise is None:
-            if self._smoother is None or len(rows) >= 10 * LEAST:
-                found = fit(fixes, accel, most=1000)
-                # an axis that is known to stand still for one hour may move in the next
-                least = FusionSettings().gnss_only_q_m2ps3 * 1e-6
-                noise = Noise(np.maximum(found.noise.q, least), np.maximum(found.noise.qb, least * 1e-3))
-                fixes = Fixes(
-                    fixes.t_ns, fixes.z_m, fixes.std_m * np.sqrt(np.maximum(found.r, 1e-3)), fixes.level, fixes.step
-                )
-            else:
-                noise = self._smoother.noise
+        self._offsets += list(zip(fixes.t_ns.tolist(), offset, strict=True))
+        return fixes, accel
+
+    def _asks(self, fixes: Fixes) -> bool:
+        """Whether a chapter's noise is to be found."""
+        if self._smoother is None:
+            return self.noise is None and len(fixes) >= LEAST
+        return self.noise is None and len(fixes) >= 10 * LEAST and self._since >= NOISE_EVERY
+
+    def _close(self, fixes: Fixes, accel: Accelerations, found: Fit | None = None) -> Iterator[tuple[Estimate, int]]:
+        """Filter a chapter; `found`: its noise, where that is known already."""
+        if self._smoother is None and len(fixes) < LEAST:
+            self._offsets = []
+            return
+        if self._asks(fixes):
+            found = found or fit(fixes, accel, r=self.fixed_r, most=NOISE)
+            # an axis that is known to stand still for one hour may move in the next
+            least = FusionSettings().gnss_only_q_m2ps3 * 1e-6
+            noise = Noise(np.maximum(found.noise.q, least), np.maximum(found.noise.qb, least * 1e-3))
+            self._r, self._since = np.maximum(found.r, 1e-3), 0
+        elif self.noise is not None:
+            noise = self.noise
+        elif self._smoother is not None:
+            noise = self._smoother.noise
+        else:
+            return
+        self._since += len(fixes)
+        if self.noise is None:
+            fixes = Fixes(fixes.t_ns, fixes.z_m, fixes.std_m * np.sqrt(self._r), fixes.level, fixes.step)
         if self._smoother is None:
             self._smoother = Smoother(noise)
         self._smoother.noise = noise
-        self._offsets += list(zip(fixes.t_ns.tolist(), offset, strict=True))
         for s in self._smoother.add(fixes, accel):
             yield from self._blocks(s)
 
@@ -161,8 +201,8 @@ class Smoothed:
         times = np.array([t for t, _ in self._offsets], np.int64)
         aided = self.accelerometer is not None
         limit = np.array([self.fusion.invalid_std_horizontal_m] * 2 + [self.fusion.invalid_std_vertical_m])
-        for lo in range(0, len(s.t_ns), BLOCK):
-            k = slice(lo, min(lo + BLOCK, len(s.t_ns)))
+        for lo in range(0, len(s.t_ns), self.block):
+            k = slice(lo, min(lo + self.block, len(s.t_ns)))
             first = int(s.t_ns[lo])
             node = int(np.clip(np.searchsorted(s.fix_ns, first, side="right") - 1, 0, len(s.fix_ns) - 1))
             sd = np.sqrt(np.maximum(np.diagonal(s.P[node], axis1=0, axis2=1).T, 0.0))
@@ -180,6 +220,22 @@ class Smoothed:
         self._offsets = self._offsets[max(0, done - 1) :]
 
 
+def add_all(each: Mapping[str, Smoothed], piece: Piece) -> Iterator[tuple[str, Estimate, int]]:
+    """Feed a piece to all points; yields as `Smoothed.add` with the point's name in front. Chapters that end together
+    are computed together."""
+    for name, one in each.items():
+        for e, offset in one._take(piece):
+            yield name, e, offset
+    full = [(name, one) for name, one in each.items() if one._full]
+    for lo in range(0, len(full), SIDE_BY_SIDE):
+        part = [(name, one, one._chapter(one.chapter)) for name, one in full[lo : lo + SIDE_BY_SIDE]]
+        asking = [chapter for _, one, chapter in part if one._asks(chapter[0])]
+        found = iter(fits(asking, r=part[0][1].fixed_r, most=NOISE))
+        for name, one, chapter in part:
+            for e, offset in one._close(*chapter, next(found) if one._asks(chapter[0]) else None):
+                yield name, e, offset
+
+
 def smoothed(
     files: Sequence[Path], points: Sequence[str], *, noise: Noise | None = None, chapter: int = CHAPTER
 ) -> Iterator[tuple[Estimate, int]]:
@@ -194,12 +250,11 @@ def smoothed(
     reached = dict.fromkeys(points, -(1 << 62))  # UTC up to which a point has come
     count = 0
 
-    def take(name: str, blocks: Iterator[tuple[Estimate, int]]) -> None:
+    def take(name: str, e: Estimate, offset: int) -> None:
         nonlocal count
-        for e, offset in blocks:
-            count += 1
-            reached[name] = int(e.t_ns[0]) + offset
-            heapq.heappush(held, (reached[name], count, e, offset))
+        count += 1
+        reached[name] = int(e.t_ns[0]) + offset
+        heapq.heappush(held, (reached[name], count, e, offset))
 
     def ready(everything: bool) -> Iterator[tuple[Estimate, int]]:
         while held and (everything or held[0][0] <= min(reached.values()) or len(held) > HELD):
@@ -207,11 +262,12 @@ def smoothed(
             yield e, offset
 
     for piece in pieces(files, config, accelerations=aided):
-        for name, one in each.items():
-            take(name, one.add(piece))
+        for name, e, offset in add_all(each, piece):
+            take(name, e, offset)
         yield from ready(False)
     for name, one in each.items():
-        take(name, one.finish())
+        for e, offset in one.finish():
+            take(name, e, offset)
     yield from ready(True)
 
 

@@ -3,15 +3,12 @@ sd, their track over windows, wavelet scalogram and band.
 
 Densities are one-sided, in unit^2/Hz. A mode is fitted to the periodogram itself by Whittle's likelihood (Whittle
 1953; for modes: Yuen & Katafygiotis 2003, Au 2011): power of one damped resonance under a flat force plus a floor. It
-needs no averaging, gives the sd from the curvature, and works on accelerations and displacements alike. `identify`
-hands several channels to stochastic subspace identification (pyOMA2, extra `review`), imported when used.
+needs no averaging, gives the sd from the curvature, and works on accelerations and displacements alike. Left out: modes
+of several channels at once (modal).
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
-import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -196,26 +193,52 @@ def fit_mode(x: F64, rate_hz: float, guess_hz: float, width_hz: float, *, accele
     y = x - x.mean()
     y = y - ramp * float((ramp @ y) / (ramp @ ramp))
     power = np.abs(np.fft.rfft(y * window)) ** 2
-    f = np.arange(len(power)) * (rate_hz / n)
+    f: F64 = np.arange(len(power), dtype=np.float64) * (rate_hz / n)
     band = (f >= max(guess_hz - width_hz, 2 * rate_hz / n)) & (f <= min(guess_hz + width_hz, 0.48 * rate_hz))
-    f, power = f[band], power[band]
-    if len(f) < 12:
+    return _fitted(f[band], power[band], guess_hz, width_hz, 1.0, accelerations)
+
+
+def fit_density(
+    freq_hz: F64, psd: F64, segments: float, guess_hz: float, width_hz: float, *, accelerations: bool = False
+) -> Mode:
+    """The mode near guess_hz from a Welch density (k,) of `segments` Hann segments: the likelihood of so many averaged
+    periodograms, whose neighbouring lines share 1.5 lines' worth, of a resonance as the window blurs it."""
+    dof = segments / (1.0 + 2.0 * HANN_OVERLAP)
+    band = (np.abs(freq_hz - guess_hz) <= width_hz) & (freq_hz > 2.0 * freq_hz[1])
+    return _fitted(freq_hz[band], psd[band], guess_hz, width_hz, dof / 1.5, accelerations, float(freq_hz[1]))
+
+
+BLUR = np.arange(-1.75, 1.76, 0.25)
+"""Lines apart at which a Hann window's main lobe is taken,"""
+LOBE = (np.sinc(BLUR) / np.where(np.abs(BLUR) == 1.0, np.inf, 1.0 - BLUR**2) + 0.5 * (np.abs(BLUR) == 1.0)) ** 2
+"""and its power there."""
+
+
+def _fitted(
+    f: F64, power: F64, guess_hz: float, width_hz: float, weight: float, accelerations: bool, line_hz: float = 0.0
+) -> Mode:
+    """The resonance that makes densities (k,) at f most likely; `weight`: how many independent ones each line is;
+    `line_hz`: of a Hann window that blurs it, 0 = none."""
+    if len(f) < 12 or not power.any():
         return NO_MODE
     power = power / power.mean()
     lift = f**4 / guess_hz**4 if accelerations else np.ones_like(f)
+    share = (LOBE / LOBE.sum())[:, None] if line_hz else np.ones((1, 1))
+    near_f = f + line_hz * BLUR[:, None] if line_hz else f[None, :]
     lean = np.log(f / guess_hz)
 
     def model(theta: F64) -> tuple[F64, F64]:
         """S (k,) and its derivatives (5, k) in ln f0, ln zeta, ln height, ln floor, slope."""
         f0, z = math.exp(theta[0]), math.exp(theta[1])
-        a, b = f0 * f0 - f * f, 2 * z * f0 * f
+        a, b = f0 * f0 - near_f * near_f, 2 * z * f0 * near_f
         D = a * a + b * b
-        peak = math.exp(theta[2]) * (2 * z * f0 * f0) ** 2 * lift / D
+        each = share * math.exp(theta[2]) * (2 * z * f0 * f0) ** 2 * lift / D
+        peak = each.sum(axis=0)
         floor = math.exp(theta[3]) * np.exp(-theta[4] * lean)
         return peak + floor, np.stack(
             [
-                peak * (4.0 - (4 * f0 * f0 * a + 2 * b * b) / D),
-                peak * (2.0 - 2 * b * b / D),
+                (each * (4.0 - (4 * f0 * f0 * a + 2 * b * b) / D)).sum(axis=0),
+                (each * (2.0 - 2 * b * b / D)).sum(axis=0),
                 peak,
                 floor,
                 -lean * floor,
@@ -224,24 +247,25 @@ def fit_mode(x: F64, rate_hz: float, guess_hz: float, width_hz: float, *, accele
 
     def cost(theta: F64) -> float:
         S = model(theta)[0]
-        return float(np.log(S).sum() + (power / S).sum()) + 0.02 * float(theta[4]) ** 2
+        return weight * float(np.log(S).sum() + (power / S).sum()) + 0.02 * float(theta[4]) ** 2
 
+    narrow = math.log(0.1 * line_hz / guess_hz) if line_hz else -12.0  # a tone is as wide as the window shows it
     smooth = np.convolve(power, np.ones(3) / 3, mode="same")
     near = np.abs(f - guess_hz) <= 0.5 * width_hz
     top = float(f[near][int(np.argmax(smooth[near]))]) if near.any() else guess_hz
     quiet = float(np.median(power))
     tried = []
-    for start in (top, guess_hz):
-        for z in (0.003, 0.02):
+    for start in (top,) if line_hz else (top, guess_hz):
+        for z in (0.01,) if line_hz else (0.003, 0.02):
             theta = np.array([math.log(start), math.log(z), math.log(smooth.max()), math.log(quiet), 0.0])
-            tried.append(_descend(theta, model, cost, power))
+            tried.append(_descend(theta, model, cost, power, weight, narrow))
     value, theta = min(((cost(theta), theta) for theta in tried), key=lambda pair: pair[0])
     S, dS = model(theta)
-    bare = min(_floor_only(lean, power, p) for p in np.linspace(-4.0, 4.0, 17).tolist())
+    bare = weight * min(_floor_only(lean, power, p) for p in np.linspace(-4.0, 4.0, 17).tolist())
     f0, z = math.exp(theta[0]), math.exp(theta[1])
     G = dS / S
     try:
-        cov = np.linalg.inv(G @ G.T + np.diag([0, 0, 0, 0, 0.04]))
+        cov = np.linalg.inv(weight * (G @ G.T) + np.diag([0, 0, 0, 0, 0.04]))
     except np.linalg.LinAlgError:
         return NO_MODE
     if bare - value < MODE_GAIN or not f[0] < f0 < f[-1] or not 1e-5 < z < 0.5 or not (np.diag(cov) > 0).all():
@@ -258,19 +282,26 @@ def _floor_only(lean: F64, power: F64, slope: float) -> float:
     return float(np.log(level * shape).sum()) + len(power)
 
 
-def _descend(theta: F64, model: Callable[[F64], tuple[F64, F64]], cost: Callable[[F64], float], power: F64) -> F64:
+def _descend(
+    theta: F64,
+    model: Callable[[F64], tuple[F64, F64]],
+    cost: Callable[[F64], float],
+    power: F64,
+    weight: float,
+    narrow: float,
+) -> F64:
     """Fisher scoring with a damping that grows until a step pays."""
     value, damp = cost(theta), 1e-3
     for _ in range(60):
         S, dS = model(theta)
         G = dS / S
-        fisher = G @ G.T
-        slope = G @ (power / S - 1.0)
+        fisher = weight * (G @ G.T)
+        slope = weight * (G @ (power / S - 1.0))
         slope[4] -= 0.02 * theta[4]
         while damp < 1e8:
             step = np.linalg.solve(fisher + damp * np.diag(np.diag(fisher) + 1e-9), slope)
             step = np.clip(step, [-0.05, -1.0, -2.0, -2.0, -1.0], [0.05, 1.0, 2.0, 2.0, 1.0])
-            new = np.clip(theta + step, [-20.0, -12.0, -30.0, -30.0, -12.0], [20.0, 0.0, 30.0, 30.0, 12.0])
+            new = np.clip(theta + step, [-20.0, narrow, -30.0, -30.0, -12.0], [20.0, 0.0, 30.0, 30.0, 12.0])
             moved = cost(new)
             if moved <= value:
                 break
@@ -305,48 +336,6 @@ def track(
             x = stream.x[k, 0]
             modes.append([fit_mode(x, stream.rate_hz, g, width_hz, accelerations=accelerations) for g in guesses_hz])
     return Track(np.array(times, dtype=np.int64), modes)
-
-
-class Identified(NamedTuple):
-    """A mode by subspace identification: frequency, damping, their sd, and its shape (channels,), largest part 1."""
-
-    freq_hz: float
-    std_freq_hz: float
-    damping: float
-    std_damping: float
-    shape: npt.NDArray[np.complex128]
-
-
-def identify(
-    x: F64, rate_hz: float, guesses_hz: Sequence[float], *, order: int = 40, rows: int = 30, reach: float = 0.05
-) -> list[Identified]:
-    """Covariance-driven stochastic subspace identification of channels x (n, c) by pyOMA2, with uncertainty (Dohler &
-    Mevel 2013). Of the stable poles within `reach` of each guess, the one of the least sd; guesses without one are left
-    out. ModuleNotFoundError without the extra `review`.
-
-    Thin the stream first: `rows` block rows must span a good part of the slowest period.
-    """
-    from pyoma2.algorithms import SSI
-    from pyoma2.setup import SingleSetup
-
-    setup = SingleSetup(x - x.mean(axis=0), fs=rate_hz)
-    method = SSI(name="ssi", method="cov", br=rows, ordmax=order, calc_unc=True, nb=20)
-    setup.add_algorithms(method)
-    logging.getLogger("pyoma2").setLevel(logging.WARNING)
-    with contextlib.redirect_stderr(io.StringIO()):  # it draws progress bars
-        setup.run_all()
-    r = method.result
-    found = []
-    for guess in guesses_hz:
-        near = (np.abs(r.Fn_poles - guess) <= reach * guess) & (r.Lab == 1) & np.isfinite(r.Fn_poles_std)
-        if near.any():
-            where = np.argwhere(near)
-            i, j = where[int(np.argmin(r.Fn_poles_std[near]))].tolist()
-            shape = r.Phi_poles[i, j]
-            shape = shape / shape[int(np.argmax(np.abs(shape)))]
-            f, f_sd = float(r.Fn_poles[i, j]), float(r.Fn_poles_std[i, j])
-            found.append(Identified(f, f_sd, float(r.Xi_poles[i, j]), float(r.Xi_poles_std[i, j]), shape))
-    return found
 
 
 # ------------------------------------------------------------------------------------------------------------- wavelets

@@ -135,8 +135,8 @@ ROWS = (
         "smoother, an hour x 3 axes, 250 Hz + 10 Hz",
         "s",
         Task("rts", 1, "s", needs=("edge_agent.review.smooth",)),
-        {"filterpy": Task("filterpy_rts", 1, "s", needs=("filterpy",))},
-        (Goal(0.5),),
+        {"filterpy": Task("filterpy_rts", 1, "s", needs=("filterpy",)), "plain floor": Task("floor_rts", 1, "s")},
+        (Goal(0.5), Goal(1.2, "plain floor")),
     ),
 )
 IMPORTS = Task("imports", 1, "ms")
@@ -145,7 +145,10 @@ LIVE = {
     "live-500": (2, "whole agent, 500 frames/s + 10 Hz, 2 points"),
 }
 BUSY = "this machine stood still too often"
-NAMES = (*LIVE, *(r.name for r in ROWS))
+REVIEW = "review"
+NAMES = (*LIVE, *(r.name for r in ROWS), REVIEW)
+SHORT_S, LONG_S, DAY_S = 600, 1800, 86_400
+"""A review has work that does not grow with the record; what an hour adds is the difference of these two."""
 
 
 def say(text: str) -> None:
@@ -247,6 +250,33 @@ def measure_live(bench: Bench, name: str, rounds: int) -> list[Result]:
     return found
 
 
+def measure_review(bench: Bench, day: bool) -> list[Result]:
+    """A day of 8 sensors at 250 Hz and 10 Hz fixes, reviewed: minutes by the clock and of processors, memory. `day`:
+    that day itself, an hour in the making; else from two short records."""
+    import day as days
+
+    def run(seconds: int) -> dict[str, float]:
+        place = bench.folder / f"review-{seconds}"
+        say(f"review: recording {seconds / 3600:.2f} h")
+        folder = days.record(place, seconds)
+        say(f"review: reading {seconds / 3600:.2f} h")
+        return whole_agent.figures_of(["review", "-", str(folder), str(place / "report.html")], bench.env, 7200)
+
+    if day:
+        found = run(DAY_S)
+        wall, cpu = found["wall"], found["cpu"]
+    else:
+        short, found = run(SHORT_S), run(LONG_S)
+        more = (DAY_S - LONG_S) / (LONG_S - SHORT_S)
+        wall, cpu = (found[k] + more * (found[k] - short[k]) for k in ("wall", "cpu"))
+    how = "" if day else ", by two short ones"
+    return [
+        Result(f"review of a day{how}", "min", (Goal(10.0),), [wall / 60]),
+        Result(f"review of a day, CPU{how}", "min", (), [cpu / 60]),
+        Result("review, memory", "MiB", (Goal(600.0),), [found["mib"]]),
+    ]
+
+
 def chosen(text: str) -> list[str]:
     """Names of rows by their name or its first part; ValueError for one that is none."""
     wanted = [w.strip() for w in text.split(",") if w.strip()]
@@ -256,7 +286,7 @@ def chosen(text: str) -> list[str]:
     return [n for n in NAMES if not wanted or n in wanted or n.split("-")[0] in wanted]
 
 
-def this(bench: Bench, names: Sequence[str], rounds: int) -> tuple[list[Result], list[str]]:
+def this(bench: Bench, names: Sequence[str], rounds: int, day: bool = False) -> tuple[list[Result], list[str]]:
     """Every chosen row: results, and the rows that failed with their reason."""
     results: list[Result] = []
     failed: list[str] = []
@@ -265,6 +295,8 @@ def this(bench: Bench, names: Sequence[str], rounds: int) -> tuple[list[Result],
         try:
             if name in LIVE:
                 results += measure_live(bench, name, rounds)
+            elif name == REVIEW:
+                results += measure_review(bench, day)
             else:
                 row = next(r for r in ROWS if r.name == name)
                 results.append(measure(bench, row, rounds))
@@ -280,6 +312,8 @@ def compare(bench: Bench, other: dict[str, str], names: Sequence[str], rounds: i
     failed: list[str] = []
     for name in names:
         try:
+            if name == REVIEW:
+                raise RuntimeError("is not compared; run it in both checkouts")
             if name in LIVE:
                 points, _ = LIVE[name]
                 pair: dict[str, list[float]] = {"old": [], "new": []}
@@ -327,6 +361,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rows", default="", help=f"comma-separated: {', '.join(NAMES)}")
     parser.add_argument("--rounds", type=int, default=3, help="runs of each figure, at least 1 (default 3)")
     parser.add_argument("--compare", metavar="COMMIT", help="measure this commit's code in turn with the present one")
+    parser.add_argument("--day", action="store_true", help="review: a whole day, recorded first; an hour or two")
     parser.add_argument("--json", action="store_true", help="results as JSON")
     parser.add_argument("--strict", action="store_true", help="exit code 1 when a goal is missed")
     args = parser.parse_args(arguments)
@@ -341,7 +376,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         bench = Bench(folder, environment(ROOT))
         if args.compare:
             if not args.rows:
-                names = [n for n in names if n not in LIVE]
+                names = [n for n in names if n not in (*LIVE, REVIEW)]
                 say(f"without {', '.join(LIVE)}: name them in --rows, each pair takes two minutes")
             try:
                 with checkout(args.compare, folder) as place:
@@ -350,7 +385,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 parser.error(str(e))
             print(text)
         else:
-            results, failed = this(bench, names, args.rounds)
+            results, failed = this(bench, names, args.rounds, args.day)
             missed = figures.misses(results)
             if args.json:
                 print(json.dumps({"rows": figures.as_json(results), "missed": missed, "failed": failed}, indent=2))

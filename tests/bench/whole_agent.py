@@ -159,9 +159,9 @@ def measure(
     return found
 
 
-def figures_of(arguments: Sequence[str], env: dict[str, str]) -> dict[str, float]:
+def figures_of(arguments: Sequence[str], env: dict[str, str], most_s: float = 300.0) -> dict[str, float]:
     p = _start(arguments, env)
-    out, err = p.communicate(timeout=300)
+    out, err = p.communicate(timeout=most_s)
     if p.returncode:
         raise RuntimeError(f"{' '.join(arguments)}: {err[-2000:]}")
     return dict(json.loads(out.splitlines()[-1]))

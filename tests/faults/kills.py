@@ -74,6 +74,7 @@ class Site:
     def __init__(self, folder: Path) -> None:
         self.folder, self.rec = folder, folder / "rec"
         self.serial, self.can = Terminal(), Watched()
+        self.begun_ns = 0  # when the player of the latest run began
         (folder / "a.dbc").write_text(dbc_text(SCENARIO))
         wiring = Wiring(self.serial.path, "slcan", self.can.path)
         text = config_yaml(SCENARIO, dbc="a.dbc", site="site", data_dir="rec", wiring=wiring)
@@ -91,6 +92,7 @@ class Site:
         schedules = [(self.serial, serial_schedule(record)), (self.can, can_schedule(record, self.can))]
         if wait_ready(sinks, PATIENCE_S, lambda: agent.poll() is None and not ended.is_set()):
             self.can.last_ns, self.can.waits = 0, []
+            self.begun_ns = time.monotonic_ns()
             play(schedules, time.monotonic_ns() - START_NS, stop=ended)
 
 
@@ -157,8 +159,10 @@ def one_kill(site: Site, seed: int, rng: random.Random) -> dict[str, float]:
     files = [p for p in site.rec.iterdir() if p.name.removesuffix(".part") in new]
     starved = waits[-1][1] - next(w for t, w in waits if t > waits[-1][0] - 2.0)
     late = (site.can.late_ns(killed_ns) + starved) / S
-    lost = (killed_ns - newest_ns([p for p in files if p.stat().st_size])) / S
+    newest = newest_ns([p for p in files if p.stat().st_size])  # 0 where the kill came before the first file's head
+    lost = (killed_ns - (newest or site.begun_ns)) / S
     return {
+        "empty": not newest,
         "alive": killed_ns / S - first_s,
         "files": len(new),
         "lost": lost,
@@ -176,10 +180,10 @@ def doctor(path: Path) -> str:
     return "" if (summary["errors"], summary["warnings"]) == (0, 0) else f"{findings[:3]}"
 
 
-def judge(site: Site, kills: int) -> list[str]:
-    """What does not hold of the files, after the last recovery."""
+def judge(rec: Path, ends: int, reason: str = "kill") -> list[str]:
+    """What does not hold of the files of runs that came to such an end, after the last recovery."""
     wrong = []
-    files = sorted(site.rec.glob("*.mcap*"))
+    files = sorted(rec.glob("*.mcap*"))
     torn = [p for p in files if REPAIRED_METADATA in reader.read_metadata(p)]
     said = 0
     for path in torn:
@@ -197,16 +201,16 @@ def judge(site: Site, kills: int) -> list[str]:
         said += report.compared
         if not report.ok:
             wrong.append(f"{path.name}: {report}")
-    everything = replay([site.rec], None, None, True)
+    everything = replay([rec], None, None, True)
     if not everything.ok:
         wrong.append(f"all files: {everything}")
-    verdict = verify([site.rec])
+    verdict = verify([rec])
     wrong += [f"verify: {w}" for w in verdict.wanting]
     reasons = [g.reason for g in verdict.gaps if g.source == "all"]
-    if reasons.count("kill") != kills or set(reasons) - {"kill"}:
-        wrong.append(f"verify: {kills} kills, but the gaps are {dict(Counter(reasons))}")
+    if reasons.count(reason) != ends or set(reasons) - {reason}:
+        wrong.append(f"verify: {ends} times {reason}, but the gaps are {dict(Counter(reasons))}")
     print(
-        f"{len(files)} files, {len(torn)} of them torn and repaired, {len(names(site.rec)) - len(files)} left over; ",
+        f"{len(files)} files, {len(torn)} of them torn and repaired, {len(names(rec)) - len(files)} left over; ",
         end="",
     )
     print(f"replay: {said} derived records equal in the torn files, {everything.compared} in all")
@@ -244,7 +248,7 @@ def main(argv: list[str]) -> int:
             wrong.append("the last run did not end in order")
         ended.set()
         player.join()
-        wrong += judge(site, kills)
+        wrong += judge(site.rec, kills - sum(bool(r["empty"]) for r in rows))  # no gap of its own: nothing lies between
         site.serial.close()
         site.can.close()
     lost = np.array([r["lost"] for r in rows])

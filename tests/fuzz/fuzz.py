@@ -35,7 +35,7 @@ from all_topics import checkpoint, records
 
 import drivers
 from drivers import can_port
-from edge_agent import assemble, config
+from edge_agent import assemble, cat, config, importer, observe, status, verify, watch
 from edge_agent.messages import AccelerometerSettings, CanFrames, Config, PortSettings, Raw, S, SignalField
 from edge_agent.recording import reader, repair, topics
 from edge_agent.recording.writer import SegmentWriter
@@ -79,6 +79,11 @@ def nmea(data: bytes) -> Hashable:
     return tuple(sorted(k for k, v in whole.counters.items() if v))
 
 
+def _summed(line: bytes) -> bytes:
+    """A sentence up to its `*`, with the sum and the end."""
+    return line + b"%02X\r\n" % functools.reduce(lambda a, b: a ^ b, line[1:-1])
+
+
 def nmea_seeds() -> list[bytes]:
     some = b"".join(b for _, b in nmea_bursts(simulate("clean", 1, 2.0)))
     lines = (
@@ -89,7 +94,7 @@ def nmea_seeds() -> list[bytes]:
     )  # fmt: skip
     return [
         some[:400],
-        b"".join(line + b"%02X\r\n" % functools.reduce(lambda a, b: a ^ b, line[1:-1]) for line in lines),
+        b"".join(map(_summed, lines)),
     ]
 
 
@@ -204,6 +209,17 @@ def slcan_seeds() -> list[bytes]:
 
 
 YAML = config_yaml(SCENARIO, dbc="a.dbc")
+FULL = (
+    YAML.replace("{port: gnss}", "{port: gnss, heading: true}")
+    + """\
+triggers:
+  sag: {point: deck, axis: z, above_m: 0.002}
+  swing: {point: deck, axis: horizontal, above_mps: 0.01}
+  shock: {point: deck, above_mps2: 0.05}
+  plug: {fault: PORT_LOST}
+events: {before_s: 2, after_s: 3, hold_s: 1, release: 0.5, max_s: 60, clips_gb: 1, hook: [/bin/true, -x], hook_s: 2}
+"""
+)
 
 
 def dbc(data: bytes) -> Hashable:
@@ -230,6 +246,7 @@ def yaml_seeds() -> list[bytes]:
     example = Path(HERE.parents[1], "systemd", "example.yaml").read_bytes()
     return [
         YAML.encode(),
+        FULL.encode(),
         example[:3000],
         b"site: a\nports: {a: {kind: serial, device: /dev/x}}\ndata_dir: x\nevents: {hook: [a]}",
     ]
@@ -237,15 +254,115 @@ def yaml_seeds() -> list[bytes]:
 
 @functools.cache
 def _made() -> Config:
-    return config.parse(YAML, Path(), lambda name: dbc_text(SCENARIO).encode())
+    return config.parse(FULL, Path(), lambda name: dbc_text(SCENARIO).encode())
+
+
+@functools.cache
+def _script() -> tuple[Raw, ...]:
+    """Some seconds of a bridge that shakes, with a heading in every epoch."""
+    found = []
+    for raw in raw_blocks(simulate("clean", 1, 22.0)):
+        if isinstance(raw.payload, bytes):
+            heading = b"$GNHDT,%.2f,T*" % (45.0 + raw.order % 3)
+            raw = replace(raw, payload=raw.payload + _summed(heading))
+        found.append(raw)
+    return tuple(found)
 
 
 @functools.cache
 def _saved() -> tuple[bytes, bytes]:
     pipeline = assemble.pipeline(_made())
-    for raw in raw_blocks(simulate("clean", 1, 17.0)):
-        pipeline.step(raw)
+    for raw in _script():
+        if raw.t_ns <= PATH_NS:
+            pipeline.step(raw)
     return pipeline.save(), pipeline.slow()
+
+
+PATH_NS = 1017 * S  # where the path's input begins
+
+
+def path(data: bytes) -> Hashable:
+    """Garbage in mid-stream, through everything behind the ports: 3 bytes of head for each block (port and time, length
+    in units of 4), then its content; good blocks of the script go on beside it. It must pass, and what has come of it
+    must go through a checkpoint."""
+    pipeline = assemble.pipeline(_made())
+    pipeline.load(_saved()[0])
+    rest = iter([raw for raw in _script() if raw.t_ns > PATH_NS])
+    t_ns, kinds = PATH_NS, set()
+    at = 0
+    while at + 3 <= len(data) and at < 6000:
+        what, length = data[at], 4 * int.from_bytes(data[at + 1 : at + 3], "little") % 1500
+        content = data[at + 3 : at + 3 + length]
+        at += 3 + length
+        t_ns += (what >> 2) * (S // 50)
+        raws = [Raw(t_ns, 0, "gnss", content)]
+        if what & 3 == 1:
+            raws = [Raw(t_ns, 0, "can", _frames(content))] if len(content) >= 22 else []
+        elif what & 3 >= 2:
+            raws = [r for r, _ in zip(rest, range(1 + length % 40), strict=False)]
+            t_ns = max([t_ns, *(r.t_ns for r in raws)])
+        for raw in raws:
+            for record in pipeline.step(replace(raw, order=pipeline.order, t_ns=max(t_ns, raw.t_ns))):
+                if record.topic == "/events":
+                    kinds.add(topics.decode(topics.EVENT, record.data)["kind"])
+    pipeline.load(pipeline.save())
+    pipeline.finish()
+    return tuple(sorted(kinds))
+
+
+def path_seeds() -> list[bytes]:
+    def block(what: int, content: bytes) -> bytes:
+        content = content.ljust(-(-len(content) // 4) * 4, b" ")
+        return bytes([what]) + (len(content) // 4).to_bytes(2, "little") + content
+
+    good = [raw.payload for raw in _script() if raw.t_ns > PATH_NS and isinstance(raw.payload, bytes)]
+    seeds = [b"".join(block(0, x) + block(2, bytes(24)) for x in good[:9]), block(2, bytes(1400)) * 3]
+    seeds.append(b"".join(block(1, f) + block(2, bytes(64)) for f in frames_seeds()))
+    return [*seeds, block(0, nmea_seeds()[1]) + block(0, binary_seeds()[0]) + seeds[0]]
+
+
+def log(data: bytes) -> Hashable:
+    """A log of somebody else, as NMEA and as candump."""
+    shm = Path("/dev/shm")
+    with tempfile.TemporaryDirectory(dir=shm if shm.is_dir() else None) as name:
+        source = Path(name, "log")
+        source.write_bytes(data)
+        said: list[Hashable] = []
+        for wanted in ({"nmea": [("gnss", source)]}, {"can": [("can", source, None)]}):
+            try:
+                done = importer.import_logs(Path(name, f"{len(said)}.mcap"), **wanted)  # type: ignore[arg-type]
+                said.append((min(done.raws, 5), done.lost > 0, done.logs[0].noted > 0))
+            except importer.ImportRefusedError as e:
+                said.append(str(e).rpartition(": ")[2][:20])
+        return tuple(said)
+
+
+def log_seeds() -> list[bytes]:
+    candump = b"".join(b"(17800%05d.%06d) can%d %03X#%s\n" % (i, i * 999, i % 2, i, b"0A" * (i % 9)) for i in range(20))
+    candump += b"(1780000030.5) can0 18FF1234#R\n(1780000031.1) can0 123##1AABB\n(1780000032.1) can0 20000080#00\n"
+    return [candump, nmea_seeds()[0], nmea_seeds()[1] * 3, b"(1780000000.1) " + nmea_seeds()[1]]
+
+
+def status_text(data: bytes) -> Hashable:
+    """status.json as `edge-agent status` reads it and shows it."""
+    try:
+        found = status.from_json(data)
+    except status.StatusError as e:
+        return str(e)[:60]
+    watch.report(Path("status.json"), found, T)
+    status.to_prometheus(found)
+    return len(status.render(found, 80, None, T)) // 64
+
+
+def status_seeds() -> list[bytes]:
+    pipeline = assemble.pipeline(_made())
+    observer = observe.Observer(_made(), pipeline)
+    for raw in _script():
+        pipeline.step(raw)
+    queues = [status.Queue("inbox", 1, 2, 3)]
+    disk = status.Disk("/data", "recording", 1 << 30, 1 << 33, "a.mcap.part", 1000, 3.5, 4, 5000, T, 0.0, 0)
+    found = observer.status(T, T, ("run", "0", "running"), [], queues, disk)
+    return [status.to_json(found).encode()]
 
 
 def state(data: bytes) -> Hashable:
@@ -339,6 +456,8 @@ def mcap(data: bytes) -> Hashable:
         for look in (reader.info, reader.read_metadata, reader.read_attachments, reader.newest_ns):
             with contextlib.suppress(reader.DamagedError):
                 look(part)
+        verify.as_text(verify.verify([part]))
+        cat.describe([part])
         for walk in (reader.read_messages(part), reader.read_between(part, 0, 1 << 62)):
             with contextlib.suppress(reader.DamagedError):
                 for _ in walk:
@@ -346,10 +465,12 @@ def mcap(data: bytes) -> Hashable:
         (done,) = repair.recover(folder)
         if done.what == "failed":
             raise AssertionError(f"repair failed: {done.detail}")
+        verdict = verify.as_json(verify.verify([folder]))
+        cat.describe([done.path])
         found = reader.info(done.path)
         if found.damage or not found.complete or found.messages < done.messages:
             raise AssertionError(f"repaired, and still: {found.damage or 'no index'}, {found.messages} messages")
-        return done.what, len(found.topics), bool(found.attachments)
+        return done.what, len(found.topics), bool(found.attachments), len(verdict["gaps"]), len(verdict["wanting"])
     finally:
         shutil.rmtree(folder)
 
@@ -396,13 +517,14 @@ TARGETS: dict[str, Target] = {
     "frames": Target(frames, frames_seeds, ()),
     "kernel": Target(kernel, kernel_seeds, ()),
     "slcan": Target(slcan, slcan_seeds, ()),
-    "dbc": Target(
-        dbc, lambda: [dbc_text(SCENARIO).encode(), Path(HERE.parents[1], "systemd/example.dbc").read_bytes()], ()
-    ),
+    "dbc": Target(dbc, dbc_seeds, ()),
     "yaml": Target(yaml, yaml_seeds, ()),
     "state": Target(state, state_seeds, (ValueError,)),
     "load": Target(load, lambda: [bytes(range(i, i + 24)) for i in range(9)], (ValueError,)),
     "adopt": Target(adopt, lambda: [bytes(range(i, i + 24)) for i in range(9)], (ValueError,)),
+    "path": Target(path, path_seeds, ()),
+    "log": Target(log, log_seeds, ()),
+    "status": Target(status_text, status_seeds, ()),
     "mcap": Target(mcap, lambda: [_file(), _file()[:2000]], ()),
     "message": Target(message, message_seeds, ()),
 }

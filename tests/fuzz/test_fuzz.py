@@ -7,7 +7,18 @@ import random
 import fuzz
 import pytest
 
-ROUNDS = {"frames": 40, "dbc": 15, "load": 25, "adopt": 40, "yaml": 60, "mcap": 60, "slcan": 60}
+ROUNDS = {
+    "frames": 40,
+    "dbc": 15,
+    "load": 25,
+    "adopt": 40,
+    "yaml": 60,
+    "mcap": 60,
+    "slcan": 60,
+    "path": 40,
+    "log": 60,
+    "status": 60,
+}
 
 
 @pytest.mark.parametrize("name", sorted(fuzz.TARGETS))

@@ -12,11 +12,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from live import PATIENCE_S, until
 
 from edge_agent.messages import EventSettings, Record, RecordSettings, Rotate, S, TriggerSettings
 from edge_agent.recording import clips, reader, topics
 from edge_agent.recording.clips import Clips, Job, Watch
-from edge_agent.recording.segments import Recorder
+from edge_agent.recording.segments import Recorder, recover
 from edge_agent.recording.writer import RUN_METADATA
 from edge_agent.triggers import BEGIN, END
 
@@ -279,6 +280,123 @@ def test_more_clips_than_may_wait_are_refused_and_told(tmp_path: Path) -> None:
     c.close(0)  # still has room for the end
 
 
+# ------------------------------------------------------------------------------------- what a kill has left undone
+
+
+def killed(folder: Path, *some: tuple[int, Record], run: str = "r", begin: int = 0, end: int = 200) -> list[Path]:
+    """A run of which the process was killed at `end` s: lines and these records as they came, a file a minute."""
+    recorder = Recorder(
+        folder, RecordSettings(free_gb=0.0, keep_days=1e5), "site", {"run": run}, {"c": b"x"}, lambda: 1 << 40
+    )
+    for s in range(begin, end):
+        if (s - begin) % 60 == 0:
+            recorder.handle(point(s * S), s * S)
+        recorder.handle(line(s * S, f"{s}"), s * S)
+        for at, record in some:
+            if at == s:
+                recorder.handle(record, s * S)
+        recorder.idle(s * S)
+    recorder.idle((end + 2) * S)
+    path = recorder.path
+    assert path is not None
+    torn = path.read_bytes()
+    final = recorder.close()
+    assert final is not None
+    final.unlink()
+    path.write_bytes(torn)
+    recover(folder)
+    return sorted(folder.glob("*.mcap"))
+
+
+def told(kind: str, text: str, t_ns: int) -> Record:
+    data = topics.event(kind, "clips" if kind == "CLIP" else "gnss", text, (), t_ns, t_ns + OFFSET)
+    return Record("/faults", t_ns + OFFSET, t_ns + OFFSET, data, False)
+
+
+def next_start(folder: Path, *triggers: TriggerSettings, run: str = "r2", **settings: Any) -> Clips:
+    """The next run's clips, from its start to its stop."""
+    kept = RecordSettings(free_gb=0.0, keep_days=1e5)
+    recorder = Recorder(folder, kept, "site", {"run": run}, {}, lambda: 1 << 40)
+    recorder.handle(point(1000 * S), 1000 * S)
+    OPEN.append(recorder)
+    c = made(recorder, *triggers, **settings)
+    c.close(1001 * S)
+    c.run()
+    assert c.failure is None
+    return c
+
+
+def test_an_event_that_a_kill_cut_short_gets_its_clip_at_the_next_start(tmp_path: Path) -> None:
+    """GIVEN an event that had begun, and one whose clip was not yet written WHEN the process is killed THEN both clips
+    are made from the recovered files, and only once."""
+    files_ = killed(
+        tmp_path,
+        (115, event(BEGIN, "sag", 115 * S)),
+        (121, event(END, "sag", 121 * S, 118 * S)),
+        (190, event(BEGIN, "shock", 190 * S)),
+    )
+    c = next_start(tmp_path)
+    first, second = files(c)
+    assert texts(first) == list(range(105, 138))
+    assert texts(second) == list(range(180, 200))
+    run = reader.read_metadata(first)[RUN_METADATA]
+    assert (run["run"], run["clip"]) == ("r", "sag")
+    assert run["clip_of"] == f"{files_[1].name}, {files_[2].name}"
+    assert "previous_name" not in run
+    assert [(a.name, a.data) for a in reader.read_attachments(first)] == [("c", b"x")]
+    assert [f.kind for f in c.faults] == ["CLIP", "CLIP"]
+    again = next_start(tmp_path, run="r3")
+    assert len(files(again)) == 2
+    assert list(again.faults) == []
+
+
+def test_a_clip_that_was_written_before_the_kill_is_not_made_again(tmp_path: Path) -> None:
+    """Neither where it lies in the folder nor where the run says so and somebody has fetched it; a torn one is."""
+    begin = (50, event(BEGIN, "sag", 50 * S))
+    end = (55, event(END, "sag", 55 * S, 52 * S))
+    name = "site_20231114T221400Z_000.mcap"
+    killed(tmp_path / "told", begin, end, (90, told("CLIP", f"{name}: 32.0 s, sag", 90 * S)))
+    assert files(next_start(tmp_path / "told")) == []
+    killed(tmp_path / "there", begin, end)
+    (made_,) = files(next_start(tmp_path / "there"))
+    assert made_.name == name
+    assert files(next_start(tmp_path / "there", run="r3")) == [made_]
+    data = made_.read_bytes()
+    made_.unlink()
+    made_.with_name(made_.name + ".part").write_bytes(data[: len(data) // 2])
+    recover(made_.parent)
+    c = next_start(tmp_path / "there", run="r4")
+    assert [p.name[-8:] for p in files(c)] == ["000.mcap", "001.mcap"]
+    assert texts(files(c)[1]) == list(range(40, 72))
+
+
+def test_a_run_that_was_stopped_and_one_long_ago_leave_nothing(tmp_path: Path) -> None:
+    begin = (50, event(BEGIN, "sag", 50 * S))
+    killed(tmp_path / "stopped", begin, (199, line(199 * S, "stopped")))
+    assert files(next_start(tmp_path / "stopped")) == []
+    end = (55, event(END, "sag", 55 * S, 52 * S))
+    killed(tmp_path / "old", begin, end, end=600)
+    c = next_start(tmp_path / "old", max_s=30.0, before_s=1.0, after_s=1.0)
+    assert files(c) == []  # its clip was written long before the end, and has been fetched
+
+
+def test_faults_of_the_named_kind_are_made_up_for_too(tmp_path: Path) -> None:
+    killed(tmp_path, (150, told("PORT_LOST", "gone", 150 * S)), (151, told("SILENT", "", 151 * S)))
+    c = next_start(tmp_path, TriggerSettings("pulled", fault="PORT_LOST"))
+    (path,) = files(c)
+    assert texts(path) == list(range(140, 170))
+    assert [f.text.rpartition(", ")[2] for f in c.faults] == ["pulled"]
+
+
+def test_a_folder_that_cannot_be_read_is_told_and_no_crash(tmp_path: Path) -> None:
+    (path, *_) = killed(tmp_path, (50, event(BEGIN, "sag", 50 * S)))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    c = next_start(tmp_path)
+    assert [f.kind for f in c.faults] == ["CLIP_FAILED"]
+
+
 # ----------------------------------------------------------------------------------------------------------------- hook
 
 
@@ -290,7 +408,7 @@ def hooked(folder: Path, *argv: str, **settings: Any) -> tuple[Clips, Path]:
 
 def test_the_hook_gets_the_clip_and_the_names_and_no_shell_reads_it(tmp_path: Path) -> None:
     code = "import os, sys; open(sys.argv[1], 'w').write(repr((sys.argv[2:], os.environ['EDGE_AGENT_TRIGGERS'])))"
-    c, path = hooked(tmp_path, sys.executable, "-c", code, str(tmp_path / "out"), "$(reboot); `x`")
+    c, path = hooked(tmp_path, sys.executable, "-c", code, str(tmp_path / "out"), "$(reboot); `x`", hook_s=PATIENCE_S)
     assert (tmp_path / "out").read_text() == repr((["$(reboot); `x`", str(path)], "sag shock"))
     assert [f.kind for f in c.faults] == ["CLIP"]
 
@@ -298,9 +416,9 @@ def test_the_hook_gets_the_clip_and_the_names_and_no_shell_reads_it(tmp_path: Pa
 @pytest.mark.parametrize(
     ("argv", "hook_s", "said"),
     [
-        (("/bin/sh", "-c", "exit 3"), 60.0, "/bin/sh: exit code 3"),
-        (("/no/such/program",), 60.0, "/no/such/program: No such file or directory"),
-        (("/bin/true", "a\0b"), 60.0, "/bin/true: embedded null byte"),
+        (("/bin/sh", "-c", "exit 3"), PATIENCE_S, "/bin/sh: exit code 3"),
+        (("/no/such/program",), PATIENCE_S, "/no/such/program: No such file or directory"),
+        (("/bin/true", "a\0b"), PATIENCE_S, "/bin/true: embedded null byte"),
         (("/bin/sh", "-c", "sleep 1000 & sleep 1000"), 0.2, "/bin/sh: killed: it took longer than 0.2 s"),
     ],
 )
@@ -309,22 +427,47 @@ def test_a_hook_that_fails_or_hangs_is_a_fault(tmp_path: Path, argv: tuple[str, 
     assert [(f.kind, f.text) for f in c.faults][1:] == [("HOOK_FAILED", said)]
 
 
+def test_a_hook_has_none_of_the_agents_files_and_gives_way_to_it(tmp_path: Path) -> None:
+    """It waits until the agent has set its priority, or forever: the agent's patience decides."""
+    code = """
+import os, sys, time
+def mine():
+    return os.getpriority(os.PRIO_PROCESS, 0), int(open("/proc/self/oom_score_adj").read())
+want = int(sys.argv[2]), int(sys.argv[3])
+while mine() != want:
+    time.sleep(0.01)
+links = [os.readlink(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd") if os.path.exists(f"/proc/self/fd/{n}")]
+names = [n for n in os.environ if n in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")]
+open(sys.argv[1], "w").write(repr([x for x in links if "agents-own" in x] + names))
+"""
+    own = (tmp_path / "agents-own").open("w")
+    os.set_inheritable(own.fileno(), True)
+    wanted = str(max(os.getpriority(os.PRIO_PROCESS, 0), clips.HOOK_NICE)), str(clips.HOOK_OOM)
+    c, _ = hooked(tmp_path, sys.executable, "-c", code, str(tmp_path / "out"), *wanted, hook_s=PATIENCE_S)
+    own.close()
+    assert [f.kind for f in c.faults] == ["CLIP"]
+    assert (tmp_path / "out").read_text() == "[]"
+
+
 def test_what_a_hook_started_ends_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = f"sleep 1000 & echo $! > {tmp_path}/new; mv {tmp_path}/new {tmp_path}/pid; sleep 1000"
 
-    def monotonic() -> float:  # the hook's time is over once it has done what the test looks at
-        return 1000.0 if (tmp_path / "pid").exists() else 0.0
+    now = 0.0
+
+    def monotonic() -> float:  # time passes, fast, once the hook has done what the test looks at
+        nonlocal now
+        now += 1000.0 if (tmp_path / "pid").exists() else 0.0
+        return now
 
     monkeypatch.setattr(clips, "time", SimpleNamespace(monotonic=monotonic, monotonic_ns=time.monotonic_ns))
     c, _ = hooked(tmp_path, "/bin/sh", "-c", code, hook_s=0.5)
     assert [f.kind for f in c.faults] == ["CLIP", "HOOK_FAILED"]
     child = int((tmp_path / "pid").read_text())
-    end = time.monotonic() + 20.0
-    while (state := _state(child)) not in ("Z", "X", "gone") and time.monotonic() < end:
-        time.sleep(0.01)
-    if state not in ("Z", "X", "gone"):
+    try:
+        until(lambda: _state(child) in ("Z", "X", "gone"), "the end of what the hook started")
+    except AssertionError:
         os.kill(child, signal.SIGKILL)
-    assert state in ("Z", "X", "gone")
+        raise
 
 
 def _state(pid: int) -> str:

@@ -83,7 +83,6 @@ def doctor(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         [tool, "doctor", "--strict-message-order", "--format", "jsonl", path],
         capture_output=True,
         text=True,
-        timeout=60,
     )
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert done.returncode == (1 if lines[-1]["errors"] else 0), done.stderr

@@ -48,6 +48,29 @@ def test_messages_come_in_the_order_of_the_file(path: Path) -> None:
     assert only == ["/raw/can0", "/raw/gnss"] * 4
 
 
+def test_a_tally_counts_what_is_not_wanted_too(path: Path, tmp_path: Path) -> None:
+    tally = reader.Tally()
+    assert [s.topic for s in reader.read_messages(path, {"/raw/gnss"}, tally)] == ["/raw/gnss"] * 4
+    times = [r.log_ns for r in WANTED]
+    assert tally == reader.Tally(len(WANTED), min(times), max(times))
+    spoilt = tmp_path / "spoilt.mcap"
+    data = bytearray(path.read_bytes())
+    with reader.view(path) as buffer:
+        third = [reader.chunk_head(buffer, p) for p in reader.parts(buffer) if p.opcode == reader.CHUNK][2]
+    data[third.pos + third.length // 2] ^= 1
+    spoilt.write_bytes(data)
+    tally = reader.Tally()
+    with pytest.raises(DamagedError):
+        list(reader.read_messages(spoilt, (), tally))
+    assert tally.messages == 11  # of the two chunks before: one, then ten
+    assert tally.end_ns == max(times[:11])
+
+
+def test_a_walk_gives_back_what_it_has_passed(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "LET_GO", 100)
+    assert messages(path) == EVERYTHING
+
+
 def test_info_counts_what_is_there(path: Path) -> None:
     info = reader.info(path)
     assert (info.complete, info.damage, info.profile, info.library) == (True, "", "ros2", "edge-agent")

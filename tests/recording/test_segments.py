@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -15,7 +16,7 @@ from all_topics import checkpoint, records
 
 from edge_agent.messages import Record, RecordSettings, Rotate, S
 from edge_agent.recording import reader, segments, topics
-from edge_agent.recording.segments import Recorder, RecordingError, list_segments, recover
+from edge_agent.recording.segments import BELIEVED_NS, Recorder, RecordingError, list_segments, recover
 
 T = 1_700_000_000 * S  # 2023-11-14 22:13:20 UTC
 NAME = "bridge_20231114T221320Z"
@@ -143,6 +144,34 @@ def test_flush_and_fsync_come_when_due(tmp_path: Path, monkeypatch: pytest.Monke
     recorder.close()
 
 
+def test_on_a_slow_disk_an_fsync_is_over_when_it_is_due(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """GIVEN an fsync that takes 0.8 s with the records before it WHEN power may go at any time THEN it costs 5 s."""
+    synced: list[int] = []
+    now = 100 * S
+    recorder = start(tmp_path)
+    recorder.handle(rotate(), now)
+    recorder.idle(now)
+    monkeypatch.setattr(os, "fdatasync", lambda fd: synced.append(now))
+    ends = [now]
+    for i in range(12):
+        while len(synced) == i:
+            now += max(int(recorder.wait_s(now) * S), 1)
+            begun = now
+            recorder.handle(line(i), now)
+            now += S // 2  # to write the record
+            if recorder.idle(now, begun):
+                now += 3 * S // 10  # to sync
+                recorder.fsync_took(now - begun)
+                ends += [begun, now]
+    costs = [end - begun for begun, end in zip(ends[0::2], ends[2::2], strict=False)]
+    assert all(c <= 5.0 * S for c in costs[1:]), costs
+    assert costs[-1] > 4 * S
+    # A disk that takes for ever does not make it sync all the time.
+    recorder.fsync_took(60 * S)
+    assert recorder.wait_s(now) == 1.0 - 0.3
+    recorder.close()
+
+
 def test_what_waited_behind_a_rotate_is_flushed_when_it_would_have_been_without(tmp_path: Path) -> None:
     """GIVEN records that waited nearly a second for the writer WHEN a file is begun THEN they wait no more."""
     recorder = start(tmp_path)
@@ -227,11 +256,15 @@ def test_what_is_too_old_goes_and_is_told(tmp_path: Path) -> None:
     old, young = fill(tmp_path, [10.01, 9.99], 100)
     recorder = start(tmp_path, keep_days=10.0)
     recorder.handle(rotate(), 7)
+    recorder.idle(BELIEVED_NS + 6)
+    assert (tmp_path / old).exists()  # a clock that has just been set is not believed so far
+    recorder.idle(BELIEVED_NS + 60 * S + 7)
     assert not (tmp_path / old).exists()
     assert (tmp_path / young).exists()
     assert all((tmp_path / name).exists() for name in STRANGERS)
     (fault,) = recorder.drain_faults()
-    assert (fault.t_ns, fault.kind, fault.source, fault.values) == (7, "RETENTION", "recorder", (("bytes", 100.0),))
+    said = fault.t_ns, fault.kind, fault.source, fault.values
+    assert said == (BELIEVED_NS + 60 * S + 7, "RETENTION", "recorder", (("bytes", 100.0),))
     assert old in fault.text
     assert "10 days" in fault.text
     assert recorder.drain_faults() == []
@@ -243,9 +276,11 @@ def test_a_clock_that_was_not_set_ages_nothing(tmp_path: Path) -> None:
     names_1970 = fill(tmp_path, [0.5, 1.0], 100, now=2 * 86400 * S)
     (young,) = fill(tmp_path, [100.0], 100)
     recorder = start(tmp_path, keep_days=10.0)
-    recorder.handle(rotate(3 * 86400 * S))
+    recorder.handle(rotate(3 * 86400 * S), 0)
     assert recorder.drain_faults() == []
-    recorder.handle(rotate())
+    recorder.handle(replace(rotate(), reason="clock"), BELIEVED_NS)
+    assert recorder.drain_faults() == []
+    recorder.handle(rotate(), 2 * BELIEVED_NS)
     assert [f.text.split()[0] for f in recorder.drain_faults()] == [young]
     assert set(names_1970) < set(names(tmp_path))
     recorder.close()
@@ -281,16 +316,34 @@ def test_an_undisciplined_clock_deletes_nothing_for_its_age(tmp_path: Path) -> N
         recorder.handle(replace(rotate(T + year * 366 * 86400 * S), sync=False))
     assert set(made) < set(names(tmp_path))
     assert recorder.drain_faults() == []
-    recorder.handle(rotate(T + 3 * 366 * 86400 * S))
+    recorder.handle(rotate(T + 3 * 366 * 86400 * S), BELIEVED_NS)
     assert len([f for f in recorder.drain_faults() if f.kind == "RETENTION"]) >= 3
     recorder.close()
 
 
 def test_a_disk_that_others_fill_costs_no_recordings_in_vain(tmp_path: Path) -> None:
     made = fill(tmp_path, [3, 2, 1], 1000)
-    recorder = start(tmp_path, lambda: 5_000_000, free_gb=1.0)
-    recorder.handle(rotate())
+    (tmp_path / "clips").mkdir()
+    (tmp_path / "clips" / "one.mcap").write_bytes(bytes(2_000_000))
+    free = [5_000_000]
+    recorder = start(tmp_path, lambda: free[0], free_gb=0.006)
+    recorder.handle(rotate(), 0)
+    recorder.idle(100 * S)
     assert set(made) < set(names(tmp_path))
+    (fault,) = recorder.drain_faults()
+    assert (fault.kind, fault.values) == ("SPACE_SHORT", (("missing_bytes", 1e6),))
+    assert "clips, which are never deleted, 0.002 GB" in fault.text
+    free[0] = 7_000_000  # there is room again, and then it is short once more
+    recorder.idle(200 * S)
+    free[0] = 5_000_000
+    recorder.idle(300 * S)
+    assert [f.kind for f in recorder.drain_faults()] == ["SPACE_SHORT"]
+    free[0] = 7_000_000
+    recorder.idle(400 * S)
+    free[0] = -1  # it does not say: nothing is told, and nothing deleted
+    recorder.idle(500 * S)
+    assert recorder.drain_faults() == []
+    assert (tmp_path / "clips" / "one.mcap").exists()
     recorder.close()
 
 
@@ -324,7 +377,8 @@ def test_a_file_that_cannot_be_deleted_is_told_and_passed_over(tmp_path: Path, m
 
     monkeypatch.setattr(Path, "unlink", unlink)
     recorder = start(tmp_path, keep_days=1.5)
-    recorder.handle(rotate())
+    recorder.handle(rotate(), 0)
+    recorder.idle(BELIEVED_NS)
     assert [n for n in made if (tmp_path / n).exists()] == [made[0], made[2]]
     assert [f.kind for f in recorder.drain_faults()] == ["RETENTION_FAILED", "RETENTION"]
     recorder.close()
@@ -391,6 +445,53 @@ def test_a_failing_disk_seals_the_file_and_gives_back_what_is_lost(
     run = reader.read_metadata(path)["edge_agent:run"]
     before = tmp_path / run["previous_name"]
     assert run["previous_sha256"] == hashlib.sha256(before.read_bytes()).hexdigest()
+
+
+def test_a_file_system_made_read_only_by_force_is_told_at_the_next_flush(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Writes go on without an error then, into memory (`echo u >/proc/sysrq-trigger`)."""
+    recorder = start(tmp_path)
+    recorder.handle(rotate(), 0)
+    recorder.handle(line(0), 0)
+    recorder.idle(S)
+    real = os.fstatvfs
+
+    def forced(fd: int) -> object:
+        seen = real(fd)
+        return type("", (), {"f_flag": seen.f_flag | os.ST_RDONLY})
+
+    monkeypatch.setattr(os, "fstatvfs", forced)
+    recorder.handle(line(1), S)
+    recorder.idle(S + S // 2)  # not due
+    with pytest.raises(RecordingError) as caught:
+        recorder.idle(2 * S)
+    assert (caught.value.reason, caught.value.unwritten) == ("read-only", (line(1),))
+    assert recorder.path is None
+
+
+@pytest.mark.parametrize("gone", ["file", "folder"])
+def test_a_file_taken_away_is_told_at_the_next_flush_and_the_next_begins(tmp_path: Path, gone: str) -> None:
+    """Linux writes on into a file that has no name any more."""
+    data = tmp_path / "data"
+    recorder = start(data)
+    recorder.handle(rotate(), 0)
+    recorder.handle(line(0), 0)
+    recorder.idle(S)
+    assert recorder.path is not None
+    if gone == "file":
+        recorder.path.unlink()
+    else:
+        shutil.rmtree(data)
+    recorder.handle(line(1), S)
+    with pytest.raises(RecordingError, match="No such file") as caught:
+        recorder.idle(2 * S)
+    assert (caught.value.reason, caught.value.unwritten) == ("io", (line(1),))
+    recorder.handle(rotate(T + 2 * S), 2 * S)
+    recorder.handle(line(2), 2 * S)
+    path = recorder.close()
+    assert path is not None
+    assert texts(path) == ["x 2"]
 
 
 def test_a_full_disk_makes_room_with_the_oldest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

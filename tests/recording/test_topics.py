@@ -322,3 +322,17 @@ def test_damaged_bytes_are_a_value_error_and_nothing_else(schema: str, draw: st.
     for read in readers:
         with contextlib.suppress(ValueError):
             read()
+
+
+def test_a_number_that_damage_has_made_a_signalling_nan_is_no_warning() -> None:
+    """Found by fuzzing: numpy warns of them, and a warning is an error here."""
+    rng = np.random.default_rng(3)
+    made, block = estimate(rng, np.arange(3, dtype=np.int64)), accel_block(rng, np.arange(3, dtype=np.int64), 0)
+    for table in (made.displacement_m, made.std_velocity_mps, block.xyz):
+        table[:] = math.nan
+    quiet, signalling = np.float32(math.nan).tobytes(), b"\x01\x00\xa0\x7f"
+    for data in (topics.fused_block(made, 0), topics.accel_block(block, 0)):
+        assert data.count(quiet) >= 6
+    fused = topics.decode_fused_block("p", topics.fused_block(made, 0).replace(quiet, signalling))
+    assert np.isnan(fused.displacement_m).all()
+    assert np.isnan(topics.decode_accel_block("a", topics.accel_block(block, 0).replace(quiet, signalling)).xyz).all()

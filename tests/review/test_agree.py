@@ -14,7 +14,7 @@ from oracles import accel_q, first_order_hold, process_noise, transition
 
 from edge_agent.geodesy import Frame
 from edge_agent.review.agree import Agreement, Integral, agree
-from edge_agent.review.likelihood import fit
+from edge_agent.review.likelihood import fit, gains
 from edge_agent.review.smooth import NO_ACCELERATIONS, Accelerations, Fixes, noise, plain
 from edge_agent.simulate import SCENARIOS, SimRecord, run
 
@@ -234,3 +234,20 @@ def test_too_little_is_refused() -> None:
     with pytest.raises(ValueError, match="20 fixes"):
         fit(fixes.part(0, 10), accel)
     assert noise(1.0, 2.0).q.tolist() == [1.0] * 3
+
+
+def test_gaps_of_minutes_leave_the_likelihood_finite() -> None:
+    """Trials of hardly any noise have no digits left behind a gap of minutes; they must lose, not spoil the rest."""
+    rng = np.random.default_rng(4)
+    dt = np.concatenate([[0.0, 1.0, 200.0], np.ones(13), [200.0] * 3, np.ones(30)])
+    t = np.cumsum(dt)
+    q = np.tile(10.0 ** np.linspace(-22, 3, 60), (len(dt), 1))
+    for qb in (1e-26, 1e-12, 1e-4):
+        g = gains(dt, np.full_like(q, 0.003), q, np.full_like(q, qb))
+        assert np.isfinite(g.weight).all()
+        assert (g.variance >= 0.003**2).all()
+        assert np.abs(g.g0).max() <= 1.0
+    z = 0.003 * rng.standard_normal((len(t), 3))
+    found = fit(plain(ns(t), z, 0.003), NO_ACCELERATIONS)
+    assert np.isfinite(found.log_likelihood).all()
+    assert found.r == pytest.approx(np.ones(3), abs=0.6)

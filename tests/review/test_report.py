@@ -11,6 +11,7 @@ from datetime import datetime
 from html.parser import HTMLParser
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -21,8 +22,8 @@ from edge_agent.review import charts, spectra
 from edge_agent.review.charts import Plot, Scale, limits, ticks, time_scale
 from edge_agent.review.figures import as_json
 from edge_agent.review.gather import SPANS, Averaged, Extreme, Moments, PointFigures, Review, _point, gather
-from edge_agent.review.panels import PANELS, percent
-from edge_agent.review.report import page
+from edge_agent.review.panels import percent
+from edge_agent.review.report import PANELS, page
 from edge_agent.review.series import Fused, Piece
 from edge_agent.simulate import SCENARIOS, run
 from edge_agent.simulate.files import write_files
@@ -172,6 +173,7 @@ def test_frequencies_are_those_of_the_structure(gathered: Review) -> None:
 
 
 def test_the_page_stands_for_itself(html: str) -> None:
+    html = re.sub(r'"data:image/png;base64,[A-Za-z0-9+/=]+"', '"data:,"', html)  # pictures stand inside
     p = parse(html)
     assert "//" not in re.sub(r"<script>.*?</script>", "", html, flags=re.DOTALL).replace("<!--", "")
     assert not re.search(r"https?:|url\(|@import|fetch\(|XMLHttp|import\(", html)
@@ -183,7 +185,7 @@ def test_the_page_stands_for_itself(html: str) -> None:
             assert "nan" not in values["d"]
             assert "inf" not in values["d"]
     assert len(p.ids) == len(set(p.ids))
-    assert {panel.key for panel in PANELS} <= set(p.ids)
+    assert {panel.key for panel in PANELS} - set(p.ids) == {"heading"}  # no receiver gives one
     inside = [values["href"][1:] for tag, values in p.tags if tag == "a" and values["href"].startswith("#")]
     assert set(inside) == set(p.ids) - {"summary"}
     text = "".join(p.text)
@@ -197,7 +199,7 @@ def test_every_axis_has_a_unit(html: str) -> None:
         figure = figure.split("</figure>")[0]
         below = re.search(r'class="xl">([^<]*)<', figure)
         assert below
-        assert below[1] in ("UTC", "frequency [Hz]")
+        assert below[1] in ("UTC", "frequency [Hz]", "probability of a smaller innovation by chi-square")
         if 'data-values="1"' in figure:
             unit = re.search(r'class="unit">([^<]+)<', figure)
             assert unit
@@ -210,6 +212,10 @@ def test_every_axis_has_a_unit(html: str) -> None:
                 "m/s\u00b2",
                 "(m/s\u00b2)\u00b2/Hz",
                 "mm\u00b2/Hz",
+                "mm/s\u00b2",
+                "ppm",
+                "order",
+                "times as often",
             )
             assert figure.split('class="yt">')[1].split("</div>")[0].count("<span") >= 2
         assert figure.split('class="xt">')[1].count("<span") >= 2
@@ -230,7 +236,11 @@ def test_the_page_shows_the_numbers_of_the_twin(
 
 
 def test_damaged_files_are_named_and_the_rest_is_told(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    recording: Path,
+    gathered: Review,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("edge_agent.review.gather._questions", lambda p: None)  # slow, and asked above
     whole = recording.read_bytes()
@@ -240,6 +250,7 @@ def test_damaged_files_are_named_and_the_rest_is_told(
         whole[: len(whole) // 3] + bytes([whole[len(whole) // 3] ^ 4]) + whole[len(whole) // 3 + 1 :]
     )
     (tmp_path / "empty.mcap").write_bytes(b"")
+    (tmp_path / "again.mcap").write_bytes(whole)
     out = tmp_path / "report.html"
     assert main(["review", str(tmp_path), "-o", str(out), "--json"]) == 3
     said = json.loads(capsys.readouterr().out)
@@ -248,8 +259,13 @@ def test_damaged_files_are_named_and_the_rest_is_told(
     for name in ("cut.mcap", "flipped.mcap", "empty.mcap"):
         assert cells[cells.index(name) + 1] == "damaged"
         assert any(name in text for text in said["findings"])
-    assert cells[cells.index("good.mcap") + 1] == "complete"
-    assert said["points"]["deck"]["valid_samples"] > 5000
+    kept, copy = ("again.mcap", "good.mcap")
+    assert cells[cells.index(kept) + 1] == "complete"
+    assert cells[cells.index(copy) + 1] == "a copy: counted once"
+    assert {Path(c["file"]).name for c in said["copies"]} >= {"cut.mcap", copy}  # the other is broken at its begin
+    assert any(f"{copy} is a copy of data in {kept}" in text for text in said["findings"])
+    assert said["points"]["deck"]["samples"] == gathered.overview.points["deck"].stream.samples
+    assert said["receivers"]["rover"]["fixes"] == gathered.overview.receivers["rover"].stream.samples
     assert not list(tmp_path.glob("*.part"))
 
 
@@ -304,6 +320,31 @@ def test_a_month_is_as_large_as_a_minute(gathered: Review, recording: Path) -> N
 
 
 # -------------------------------------------------------------------------------------------------------------- parts
+
+
+def test_a_picture_is_a_png_of_its_shades() -> None:
+    shade = np.linspace(0.0, 1.0, 12).reshape(3, 4)
+    seen = plt.imread(io.BytesIO(charts.png(shade)), format="png")
+    assert seen.shape[:2] == (3, 4)
+    for row in range(3):
+        for column in range(4):
+            want = [int(charts.shade_colour(shade[row, column])[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+            assert np.abs(seen[row, column, :3] - want).max() < 0.02
+    light = seen[..., :3].sum(axis=2).ravel()
+    assert (np.diff(light) < 0).all()  # the more, the darker
+
+
+def test_a_logarithmic_axis_has_round_numbers_that_do_not_crowd() -> None:
+    for low, high in ((-0.35, 0.67), (0.001, 0.04), (-3.4, -0.2), (-7.0, 2.0), (-1.0, 1.9)):
+        found = ticks(Scale(low, high, "", log=True), 5)
+        assert 2 <= len(found) <= 8
+        places = [p for p, _ in found]
+        assert places == sorted(places)
+        for p, text in found:
+            at = low + p / 100 * (high - low)
+            value = text.replace("10<sup>", "1e").replace("</sup>", "").replace("\u2212", "-")
+            assert float(value) == pytest.approx(10**at, rel=1e-6)
+            assert len(text.replace("<sup>", "").replace("</sup>", "")) <= 6
 
 
 def piece(t: npt.NDArray[np.int64], d: F64, mode: npt.NDArray[np.uint8]) -> Piece:
@@ -365,20 +406,31 @@ def test_the_average_of_parts_is_welchs() -> None:
     assert np.allclose(other.high, one.high, rtol=1e-4)
 
 
-def test_a_frequency_is_tracked_in_time_in_bounded_memory() -> None:
-    rate, n = 20.0, 20 * 60 * 1000
+def test_a_frequency_is_tracked_in_time_with_an_honest_sd_in_bounded_memory() -> None:
+    """An oscillator of 1 % damping under noise, whose frequency sinks by 3 %; lines are wider than its peak."""
+    rate, n = 20.0, 20 * 60 * 400
     seconds = np.arange(n) / rate
     f = 1.0 - 0.03 * seconds / seconds[-1]
-    x = np.sin(2 * np.pi * np.cumsum(f) / rate)[:, None] * np.ones(3)
-    x = x + 0.3 * np.random.default_rng(5).standard_normal((n, 3))
-    a = Averaged(20.0)
+    pole = np.exp(-0.01 * 2 * np.pi * f / rate)
+    first, second = (2 * pole * np.cos(2 * np.pi * f / rate)).tolist(), (pole * pole).tolist()
+    force = np.random.default_rng(5).standard_normal(n).tolist()
+    y = [0.0, 0.0]
+    for k in range(2, n):
+        y.append(first[k] * y[-1] - second[k] * y[-2] + force[k])
+    acceleration = np.diff(y, 2, prepend=[0.0, 0.0]) * (rate * rate / 40.0)
+    x = acceleration[:, None] * np.ones(3) + 3.0 * np.random.default_rng(6).standard_normal((n, 3))
+    a = Averaged(25.0, keep=True)
     t = np.rint(seconds * S).astype(np.int64)
     for k in range(0, n, 1200):
         a.add("run", t[k : k + 1200], x[k : k + 1200])
     assert a.spectrum() is not None
-    middles, found = a.track([0.985, 5.0])
-    assert 200 <= len(middles) <= 400
-    assert np.abs(found[:, 0] - np.interp(middles, t, f)).max() < 0.01
+    middles, found, std = a.track([0.985, 5.0])
+    assert 48 <= len(middles) <= 96
+    wrong = (found[:, 0] - np.interp(middles, t, f)) / std[:, 0]
+    assert np.isfinite(wrong).all()
+    assert 0.6 < math.sqrt(float(np.mean(wrong * wrong))) < 1.4
+    assert abs(float(np.mean(wrong))) < 1.0  # a twentieth of a line
+    assert std[:, 0].max() < 0.01
     assert np.isnan(found[:, 1]).mean() > 0.8
 
 
@@ -429,3 +481,24 @@ def test_limits_and_shares() -> None:
     assert percent(0.99999) == "99.99 %"
     assert percent(1.0) == "100 %"
     assert percent(0.000001) == "0.01 %"
+
+
+def test_a_file_named_twice_and_a_replay_beside_its_input_count_once(tmp_path: Path) -> None:
+    """What `simulate` and `replay` leave in one folder."""
+    made = tmp_path / "made"
+    assert main(["simulate", "clean", "--seconds", "40", "-o", str(made)]) == 0
+    other = tmp_path / "other"
+    assert main(["simulate", "rough", "--seconds", "40", "-o", str(other)]) == 0
+    for folder in (made, other):
+        raw, fused = str(folder / "raw.mcap"), str(folder / "fused.mcap")
+        assert main(["replay", raw, "-c", str(folder / "config.yaml"), "-o", fused]) == 0
+    once = gather([made / "fused.mcap"])
+    twice = gather([made / "fused.mcap", made / "fused.mcap"])
+    beside = gather([made])
+    fixes = {name: sum(r.qualities.values()) for name, r in once.overview.receivers.items()}
+    assert {name: sum(r.qualities.values()) for name, r in twice.overview.receivers.items()} == fixes
+    assert {name: sum(r.qualities.values()) for name, r in beside.overview.receivers.items()} == fixes
+    assert beside.copies == {made / "raw.mcap": made / "fused.mcap"}
+    assert twice.copies == {}
+    both = gather([made / "fused.mcap", other / "fused.mcap"])  # another record of the same time is no copy
+    assert both.copies == {}

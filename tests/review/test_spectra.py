@@ -18,7 +18,6 @@ from edge_agent.review.spectra import (
     Spectrum,
     band,
     fit_mode,
-    identify,
     peaks,
     scalogram,
     track,
@@ -224,16 +223,3 @@ def test_tall_and_long_structures_keep_their_modes(name: str, seconds: float, ax
         print(f"{name} {mode.freq_hz}: fused {f.freq_hz:.4f} +- {f.std_freq_hz:.4f}, truth {true.freq_hz:.4f}")
         assert abs(f.freq_hz / true.freq_hz - 1) < 0.002
         assert abs(f.freq_hz - mode.freq_hz) < max(0.005 * mode.freq_hz, 3 * f.std_freq_hz)
-
-
-def test_subspace_identification_agrees() -> None:
-    pytest.importorskip("pyoma2", reason="the extra `review` is not installed")
-    one, two = oscillator(1.3, 0.012, 20.0, 600.0, 1), oscillator(3.1, 0.01, 20.0, 600.0, 2)
-    x = np.stack([one + 0.3 * two, 0.8 * one - 0.4 * two, 0.4 * one + 0.5 * two], axis=1)
-    x += 0.02 * np.random.default_rng(3).standard_normal(x.shape)
-    found = identify(x, 20.0, [1.3, 3.1, 5.5], order=20, rows=20)
-    assert len(found) == 2
-    for mode, f, shape in zip(found, (1.3, 3.1), ((1.0, 0.8, 0.4), (0.6, -0.8, 1.0)), strict=True):
-        assert abs(mode.freq_hz - f) < 4 * mode.std_freq_hz + 0.002
-        assert abs(mode.damping - 0.011) < 5 * mode.std_damping + 0.004
-        assert np.abs(mode.shape.real - shape).max() < 0.1

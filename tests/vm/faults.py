@@ -32,9 +32,12 @@ from edge_agent.recording import cdr, reader, topics
 
 USB = "GPS0001"
 BY_ID = f"/dev/serial/by-id/usb-QEMU_QEMU_USB_SERIAL_{USB}-if00-port0"
-WATCHDOG_S = 20  # instead of the unit's 90
+WATCHDOG_S = 45  # instead of the unit's 90
 CARD_MB = 48  # of the small disk that gets full
 HOLD_S = 8.0  # longer than record.fsync_s
+SLOW_S = 15.0  # in which the recordings' growth is measured
+PEAK_MB = 150  # the process, with record.ring_mb and the queues at their defaults
+KEPT = "/var/lib/kept"
 CARD = "/var/tmp/card.img"
 MOUNT = f"mount -o loop,errors=remount-ro {CARD} {DATA}"
 PORTS = ("gnss", "can", "adapter")
@@ -53,7 +56,8 @@ class Fault:
     back: tuple[str, ...] = ()  # kinds that say it is over, where data are no sign of it
     begin_ns: int = 0
     end_ns: int = 0
-    told_ns: int = 0  # where no recording can say it
+    told_ns: int = 0  # where no recording can say it,
+    over_ns: int = 0  # nor this
 
 
 @dataclass
@@ -99,8 +103,9 @@ class Course:
         return self.s.show("ActiveState")["ActiveState"] == "active"
 
     def records(self) -> bool:
-        """Wait until the service runs and has begun a file, and let that grow."""
+        """Wait until the service runs, has a file open and hears the CAN card, and let it record that."""
         good = self.s.ready() < float("inf") and waited(lambda: self.s.vm.run(f"ls {DATA}/*.part").rc == 0)
+        good = good and waited(lambda: "can OK" in self.s.show("StatusText")["StatusText"])
         time.sleep(4)
         return good
 
@@ -110,12 +115,16 @@ class Course:
 
     def noted(self, fault: Fault, text: str) -> None:
         """Keep when something was said after the fault, by the service or by systemd of it."""
+        fault.told_ns = self.said_ns(text, fault.begin_ns)
+
+    def said_ns(self, text: str, from_ns: int) -> int:
+        """When the journal first has it from some time on; 0 = not."""
         for line in self.s.vm.sh(f"journalctl -b -n 300 -o json --no-pager -u {SERVICE}").splitlines():
             entry = json.loads(line)
             t_ns = int(entry["__MONOTONIC_TIMESTAMP"]) * 1000
-            if t_ns >= fault.begin_ns and text in str(entry.get("MESSAGE", "")):
-                fault.told_ns = t_ns
-                return
+            if t_ns >= from_ns and text in str(entry.get("MESSAGE", "")):
+                return t_ns
+        return 0
 
     def host_offset_ns(self) -> int:
         """The guest's monotonic clock minus the host's."""
@@ -132,6 +141,7 @@ def prepared(s: Session, site: str, dbc: str) -> None:
     """The receiver is on a USB adapter now, which is not plugged yet, and slcan0 is of the kernel's driver."""
     tree = yaml.safe_load(site)
     tree["ports"]["gnss"]["device"] = BY_ID
+    tree["record"] = {"free_gb": 0.1}  # the disk is small: nothing shall go for want of space
     tree["ports"]["adapter"] = {"kind": "can", "interface": "socketcan", "channel": "slcan0"}
     (s.share / "faults.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
     disk = s.share / "card.img"
@@ -143,7 +153,6 @@ def prepared(s: Session, site: str, dbc: str) -> None:
     s.vm.sh("cp /mnt/share/faults.yaml /etc/edge-agent/site.yaml; cp /mnt/share/vm.dbc /etc/edge-agent/")
     s.vm.sh(f"cp --sparse=always /mnt/share/card.img {CARD}")
     s.vm.sh("slcand -o -s6 -S 115200 /dev/ttyS2 slcan0; sleep 1; ip link set slcan0 up")
-    s.vm.sh(f"mkdir -p {DROP_IN} && printf '[Service]\\nWatchdogSec={WATCHDOG_S}\\n' >{DROP_IN}/watchdog.conf")
     # the adapter passes for a receiver, whose numbers it does not have
     rule = 'SUBSYSTEM=="tty", ENV{ID_VENDOR_ID}=="0403", ENV{EDGE_GNSS}="1"'
     s.vm.sh(f"mkdir -p /run/udev/rules.d; echo '{rule}' >/run/udev/rules.d/79-test.rules; udevadm control --reload")
@@ -152,6 +161,8 @@ def prepared(s: Session, site: str, dbc: str) -> None:
 
 def course(c: Course, reboot: Callable[[], Machine], everything: bool) -> None:
     """The faults in turn, then the table; not `everything`: a late adapter, SIGSTOP and the power cut."""
+    if not everything:
+        watched(c)
     late_adapter(c)
     is_visible(c)
     if everything:
@@ -161,10 +172,13 @@ def course(c: Course, reboot: Callable[[], Machine], everything: bool) -> None:
         c.s.tally.row(seen == "0", "through all of this the process ran on", f"{seen} restarts")
         stopped(c)
         disk_full(c)
+        forced_read_only(c)
+        disk_slow(c)
+        takes_little_memory(c)
         read_only(c)
-        ended(c, ENDS)
-    else:
-        ended(c, ENDS[-1:])
+        folder_deleted(c)
+        watched(c)
+    ended(c, ENDS if everything else ENDS[-1:])
     power_cut(c, reboot)
 
 
@@ -241,13 +255,22 @@ def usb_replugged(c: Course) -> None:
 
 
 def clock_steps(c: Course) -> None:
-    for name, step in (("forth", "+"), ("back", "-")):
-        before = c.s.vm.sh(f"ls {DATA}")
-        fault = Fault(f"wall clock one hour {name}", PORTS, ("CLOCK_STEP",), "clock")
-        c.begin(fault, f"date -s @$(($(date +%s) {step} 3600))")
-        good = waited(lambda before=before: c.s.vm.sh(f"ls {DATA}") != before)  # type: ignore[misc]
-        time.sleep(3)
-        c.s.tally.row(good and c.alive(), f"{fault.name}: a new file begins", "the service runs on")
+    for name, step_s in (("one hour", 3600), ("one year", 365 * 86_400)):
+        for where, sign in (("forth", "+"), ("back", "-")):
+            before = files(c)
+            fault = Fault(f"wall clock {name} {where}", PORTS, ("CLOCK_STEP",), "clock")
+            c.begin(fault, f"date -s @$(($(date +%s) {sign} {step_s}))")
+            good = waited(lambda before=before: files(c) - before != set())  # type: ignore[misc]
+            time.sleep(3)
+            kept = before <= files(c)
+            c.s.tally.row(
+                good and kept and c.alive(), f"{fault.name}: a new file begins", "the service runs on, no file has gone"
+            )
+
+
+def files(c: Course) -> set[str]:
+    """Names of the recordings, open or finished."""
+    return {name.removesuffix(".part") for name in c.s.vm.sh(f"ls {DATA}").split() if ".mcap" in name}
 
 
 def disk_full(c: Course) -> None:
@@ -258,6 +281,7 @@ def disk_full(c: Course) -> None:
     time.sleep(HOLD_S)
     fault.end_ns = c.at(f"rm {DATA}/filler")
     good = c.s.told("DISK_OK") and told
+    fault.over_ns = c.said_ns("DISK_OK", fault.end_ns)
     c.s.tally.row(good and c.alive(), "disk full: told, and over by itself", "DISK_FULL, then DISK_OK")
 
 
@@ -277,6 +301,57 @@ def read_only(c: Course) -> None:
     fault.end_ns = c.at(f"systemctl start --no-block {SERVICE}")
     c.s.tally.row(c.records(), "disk read-only: it records on another disk", "")
     c.gnss.on = True
+
+
+def forced_read_only(c: Course) -> None:
+    """The kernel makes every disk read-only by force, as it does in an emergency; no write of an open file fails."""
+    fault = Fault("disks read-only by force (sysrq u)", (), ("DISK_READ-ONLY",), "recorder", ("DISK_OK",))
+    c.begin(fault, "echo u >/proc/sysrq-trigger")
+    told = c.s.told("DISK_READ-ONLY")
+    time.sleep(HOLD_S)
+    fault.end_ns = c.at(f"mount -o remount,rw /; mount -o remount,rw {DATA}")
+    good = c.s.told("DISK_OK") and told
+    fault.over_ns = c.said_ns("DISK_OK", fault.end_ns)
+    c.s.tally.row(good and c.alive(), f"{fault.name}: told, and over by itself", "DISK_READ-ONLY, then DISK_OK")
+
+
+def disk_slow(c: Course) -> None:
+    """The disk takes a tenth of what comes, by the limit of the service's group."""
+    size = f"du -cb {DATA}/*.mcap* | tail -n 1 | cut -f 1"
+    before, began = int(c.s.vm.sh(size)), c.at()
+    time.sleep(SLOW_S)
+    rate = (int(c.s.vm.sh(size)) - before) * S // (c.at() - began)
+    limit = max(rate // 10, 100)
+    fault = Fault("disk ten times too slow", (), ("WRITER_STALLED",), "recorder", ("WRITER_OK",))
+    set_to = f"systemctl set-property --runtime {SERVICE} IOWriteBandwidthMax="
+    c.begin(fault, f"{set_to}'{DATA} {limit}'")
+    told = c.s.told("WRITER_STALLED")
+    time.sleep(HOLD_S)
+    fault.end_ns = c.at(set_to)
+    good = c.s.told("WRITER_OK") and told
+    fault.over_ns = c.said_ns("WRITER_OK", fault.end_ns)
+    time.sleep(HOLD_S)  # what waited goes to the disk
+    text = f"WRITER_STALLED, then WRITER_OK; {limit} of {rate} bytes/s"
+    c.s.tally.row(good and c.alive(), f"{fault.name}: told, and over by itself", text)
+
+
+def folder_deleted(c: Course) -> None:
+    """Somebody deletes the folder of the recordings; second names keep what the agent writes into nowhere."""
+    fault = Fault("data folder deleted", ("can",), ("DISK_IO",), "recorder")
+    c.begin(fault, f"mkdir {KEPT} && ln {DATA}/*.mcap* {KEPT}/ && rm -rf {DATA}")
+    told = c.s.told("DISK_IO")
+    c.noted(fault, "DISK_IO")
+    good = c.records() and told
+    c.s.vm.sh(f"mkdir /mnt/out/kept && cp {KEPT}/* /mnt/out/kept/ && rm -rf {KEPT}")
+    c.s.tally.row(good, f"{fault.name}: told, and it records again by itself", "DISK_IO in the journal")
+
+
+def takes_little_memory(c: Course) -> None:
+    """What waited in memory while the disk refused stayed within its bound."""
+    pid = c.s.show("MainPID")["MainPID"]
+    found = re.search(r"VmHWM:\s+(\d+) kB", c.s.vm.sh(f"cat /proc/{pid}/status"))
+    peak_mb = int(found[1]) / 1e3 if found else float("inf")
+    c.s.tally.row(peak_mb < PEAK_MB, "through refusing disks its memory stays bounded", f"{peak_mb:.0f} MB at most")
 
 
 # --------------------------------------------------------------------------------------------------------- the process
@@ -322,6 +397,12 @@ ENDS = (
 """A name, how it is done, and what systemd says of it."""
 
 
+def watched(c: Course) -> None:
+    """A shorter watchdog from the next start on."""
+    c.s.vm.sh(f"mkdir -p {DROP_IN} && printf '[Service]\\nWatchdogSec={WATCHDOG_S}\\n' >{DROP_IN}/watchdog.conf")
+    c.s.vm.sh("systemctl daemon-reload")
+
+
 def ended(c: Course, ways: Sequence[tuple[str, str, str]]) -> None:
     """The process comes to its end in one way or another; systemd starts it again."""
     for name, command, said in ways:
@@ -361,6 +442,7 @@ def power_cut(c: Course, reboot: Callable[[], Machine]) -> None:
     text = f"can0 {state}, net.core.rmem_max {room}, modules {'loaded' if modules else 'absent'}"
     c.s.tally.row(state == "UP" and room == "4194304" and modules, "and so do interface, buffer and drivers", text)
     again_ns = c.host_offset_ns()
+    c.s.be_patient()
     c.s.stops()
     c.collect("disk")
     table(c, Fault("power cut", ("can",), begin_ns=cut_ns + offset_ns), cut_utc_ns, again_ns - offset_ns)
@@ -413,7 +495,7 @@ def gap(times: npt.NDArray[np.int64], begin_ns: int, until_ns: int) -> tuple[int
 def table(c: Course, cut: Fault, cut_utc_ns: int, boot_ns: int) -> None:
     """`cut`: the power cut; boot_ns: the monotonic clock after it minus that before it."""
     files = sorted((c.s.out / "disk").glob("*.mcap"))
-    card = [*(c.s.out / "card").glob("*.mcap"), *(c.s.out / "card").glob("*.part")]
+    card = [p for name in ("card", "kept") for p in (c.s.out / name).glob("*.mcap*")]
     new = [p for p in files if int(run_of(p)["started_utc_ns"]) > cut_utc_ns]
     old = [p for p in files if p not in new] + card
     before, after = recorded(old), recorded(new)
@@ -432,6 +514,8 @@ def table(c: Course, cut: Fault, cut_utc_ns: int, boot_ns: int) -> None:
     c.s.tally.row(good, "every fault was told and is over", "see the table")
     text = f"{before.missing + after.missing} blocks missing, {before.losses + after.losses} told by LOSS"
     c.s.tally.row(before.missing + after.missing <= before.losses + after.losses, "nothing is missing in silence", text)
+    open_ledgers = sum(kind == "LEDGER" for _, kind, _ in before.said + after.said)
+    c.s.tally.row(not open_ledgers, "the ledger balanced all the time", f"{open_ledgers} times LEDGER on /faults")
 
 
 def since(t_ns: int, begin_ns: int) -> str:
@@ -450,7 +534,7 @@ def print_row(fault: Fault, r: Recorded, until_ns: int) -> bool:
     )  # the last block of a disk fills it before dd ends
     gaps = {port: gap(r.times[port], fault.begin_ns, until_ns) for port in fault.ports}
     if fault.back:
-        over = first(fault.back, fault.end_ns)
+        over = fault.over_ns
         text = f"{r.missing} blocks of all ports, told by LOSS" if r.missing else "nothing"
     elif "CLOCK_STEP" in fault.kinds:  # nothing should be seen of it
         over = told

@@ -28,9 +28,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-BOOT_S = 240.0  # 10 s on a quiet machine; more with other work beside it
-COMMAND_S = 180.0  # of a command in the guest; most take 0.1 s
-QEMU_S = 120.0  # until QEMU opens its sockets
+BOOT_S = 600.0  # 10 s on a quiet machine; more with other work beside it
+COMMAND_S = 600.0  # of a command in the guest; most take 0.1 s
+QEMU_S = 300.0  # until QEMU opens its sockets
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +82,7 @@ def _command(image: Path, disk: Path, folder: Path, share: Path, out: Path, acce
         *(*channel("ttyS1"), "-serial", "chardev:ttyS1", *channel("ttyS2"), "-serial", "chardev:ttyS2"),
         *(*channel("agent"), "-device", "virtio-serial-pci"),
         *("-device", "virtserialport,chardev=agent,name=test.exec"),
+        *(*channel("clock"), "-device", "virtserialport,chardev=clock,name=test.clock"),
         *(*channel("usb0"), "-device", "qemu-xhci,id=xhci"),
         *("-object", "can-bus,id=bus"),
         *("-device", "kvaser_pci,canbus=bus", "-device", "kvaser_pci,canbus=bus"),
@@ -232,7 +233,7 @@ class Machine:
         self.sh(f"date -s @{time.time():.3f}")
 
     def port(self, name: str) -> socket.socket:
-        """The host's end of ttyS1, ttyS2, usb0."""
+        """The host's end of ttyS1, ttyS2, usb0, clock."""
         end_s = time.monotonic() + QEMU_S
         while time.monotonic() < end_s:
             if self._process.poll() is not None:
@@ -276,10 +277,17 @@ class Machine:
     def unplug_usb(self) -> None:
         self.qmp("device_del", id="usb0")
 
-    def power_cut(self) -> None:
-        """What a pulled plug does."""
+    def power_cut(self) -> int:
+        """What a pulled plug does. The host's monotonic ns of it."""
         self._process.kill()
+        cut_ns = time.monotonic_ns()
         self._process.wait()
+        return cut_ns
+
+    @property
+    def pid(self) -> int:
+        """QEMU's process."""
+        return self._process.pid
 
     _own: Path | None = None
 
