@@ -182,6 +182,21 @@ def _port_and_file(text: str, default: str) -> tuple[str, Path]:
     return m[1], Path(m[2])
 
 
+def _progress() -> Callable[[str], None] | None:
+    """Says on one line of a terminal how far long work is; None where stderr is none."""
+
+    def say(text: str) -> None:
+        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+
+    return say if sys.stderr.isatty() else None
+
+
+def _clear() -> None:
+    """Wipe that line."""
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
 def _compare(args: argparse.Namespace) -> int:
     """`replay --compare`: old settings against new ones."""
     if args.verify:
@@ -195,11 +210,6 @@ def _compare(args: argparse.Namespace) -> int:
     from edge_agent.replay import ReplayError, in_order, recorded_config
     from edge_agent.review import compare
 
-    talks = sys.stderr.isatty()
-
-    def progress(text: str) -> None:
-        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
-
     try:
         first = in_order(args.inputs)[0]
         if args.config:
@@ -208,8 +218,7 @@ def _compare(args: argparse.Namespace) -> int:
         else:
             old, new = recorded_config(first), recorded_config(first, args.set)
         folder = (args.output or args.page).absolute().parent
-        say = progress if talks else None
-        found = compare.compare(args.inputs, args.output, old, new, args.set, folder, say)
+        found = compare.compare(args.inputs, args.output, old, new, args.set, folder, _progress())
         if args.smooth:
             from edge_agent.review.smoothed import add_smoothed
 
@@ -220,8 +229,7 @@ def _compare(args: argparse.Namespace) -> int:
         _say(f"edge-agent: replay: {e}")
         return WANTING
     finally:
-        if talks:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        _clear()
     part = args.page.with_name(args.page.name + ".part")
     part.write_text(compare.page(found), encoding="utf-8")
     part.replace(args.page)
@@ -296,18 +304,12 @@ def _review(args: argparse.Namespace) -> int:
     from edge_agent.review.report import as_text, review
 
     ahead.allowed = True
-    talks = sys.stderr.isatty()
-
-    def progress(text: str) -> None:
-        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
-
     try:
-        found, figures = review(args.inputs, args.output, progress if talks else None)
+        found, figures = review(args.inputs, args.output, _progress())
     except ReplayError as e:
         raise WrongUseError(f"review: {e}") from None
     finally:
-        if talks:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        _clear()
     _result(args, figures, as_text(found))
     if args.output is not None:
         _say(f"report {args.output}")
@@ -319,18 +321,12 @@ def _tune(args: argparse.Namespace) -> int:
     from edge_agent.replay import ReplayError
     from edge_agent.review import tune
 
-    talks = sys.stderr.isatty()
-
-    def progress(text: str) -> None:
-        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
-
     try:
-        found = tune.tune(args.inputs, progress if talks else None)
+        found = tune.tune(args.inputs, _progress())
     except (ReplayError, ConfigError) as e:
         raise WrongUseError(f"tune: {e}") from None
     finally:
-        if talks:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        _clear()
     _result(args, tune.as_json(found), tune.as_text(found))
     return GOOD
 

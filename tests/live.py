@@ -205,13 +205,7 @@ class Live:
 
     def balance(self) -> dict[str, str]:
         """After the end: ports whose account does not balance, or says something else than the files do."""
-        there = [r.source for r in raws(recordings(self.agent.recorder.data_dir))]
-        wrong = {}
-        for name, a in self.agent.accounts.items():
-            if a.received != a.written + a.dropped + a.refused + a.lost or a.written != there.count(name):
-                said = f"received {a.received}, written {a.written}, dropped {a.dropped}, refused {a.refused}"
-                wrong[name] = f"{said}, lost {a.lost}; in the files {there.count(name)}"
-        return wrong
+        return unbalanced(self.agent)
 
     def settle(self) -> None:
         """Wait until main and the writer have dealt with everything that came."""
@@ -249,6 +243,17 @@ def raws(files: Iterable[Path]) -> list[Raw]:
     """Every raw block of the files, in file order."""
     found = [s for s in stored(files) if s.topic.startswith("/raw/") and s.topic != "/raw/checkpoint"]
     return [topics.decode_raw(s.topic, s.schema, s.data) for s in found]
+
+
+def unbalanced(agent: runtime.Agent) -> dict[str, str]:
+    """Ports of an agent that has ended whose account does not balance, or says something else than the files do."""
+    there = [r.source for r in raws(recordings(agent.recorder.data_dir))]
+    wrong = {}
+    for name, a in agent.accounts.items():
+        if a.received != a.written + a.dropped + a.refused + a.lost or a.written != there.count(name):
+            said = f"received {a.received}, written {a.written}, dropped {a.dropped}, refused {a.refused}"
+            wrong[name] = f"{said}, lost {a.lost}; in the files {there.count(name)}"
+    return wrong
 
 
 def ledgers(files: Iterable[Path]) -> dict[str, dict[str, int]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from live import raws, recordings, stored
+from live import recordings, stored, unbalanced
 
 from edge_agent import assemble, runtime
 from edge_agent.messages import Config, Raw
@@ -130,13 +130,7 @@ class Stepped:
 
     def balance(self) -> dict[str, str]:
         """Ports whose account does not balance, or says something else than the files do; after `close`."""
-        there = [r.source for r in raws(self.files())]
-        wrong = {}
-        for name, a in self.agent.accounts.items():
-            if a.received != a.written + a.dropped + a.refused + a.lost or a.written != there.count(name):
-                said = f"received {a.received}, written {a.written}, dropped {a.dropped}, refused {a.refused}"
-                wrong[name] = f"{said}, lost {a.lost}; in the files {there.count(name)}"
-        return wrong
+        return unbalanced(self.agent)
 
 
 def estimates(files: Iterable[Path]) -> list[tuple[str, int, bytes]]:

@@ -119,7 +119,10 @@ def test_the_unit_says_which_boot_it_is(monkeypatch: pytest.MonkeyPatch) -> None
     assert f"Environment={runtime.BOOT_VARIABLE}=%b" in UNIT.read_text().splitlines()
     monkeypatch.setenv(runtime.BOOT_VARIABLE, "4f2a")
     assert runtime.boot_id() == "4f2a"
+    monkeypatch.setenv(runtime.BOOT_VARIABLE, "4f-2a")  # as /proc spells it
+    assert runtime.boot_id() == "4f2a"
     monkeypatch.delenv(runtime.BOOT_VARIABLE)
+    assert "-" not in runtime.boot_id()
     assert runtime.boot_id() != "4f2a"
 
 

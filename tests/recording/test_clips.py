@@ -484,3 +484,18 @@ def test_no_hook_runs_once_the_agent_ends(tmp_path: Path) -> None:
     c.run()
     assert len(files(c)) == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_an_old_file_that_cannot_be_decoded_is_told_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that another version wrote, met at each start."""
+    c = made(recorded(tmp_path / "rec", 100))
+
+    def foreign(*_: object) -> None:
+        raise ValueError("a schema of another version")
+
+    monkeypatch.setattr(clips, "left_over", foreign)
+    assert c._left() == []
+    (fault,) = c.faults
+    assert (fault.kind, "another version" in fault.text) == ("CLIP_FAILED", True)
