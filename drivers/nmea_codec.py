@@ -26,8 +26,9 @@ GNS or GST) that came last in each of the last three epochs with a position, els
 RMC and ZDA only bring the date, and may come at any rate. Every GGA makes one fix: a second one of the same time
 begins an epoch of its own (`repeated_times` counts them). Position from GGK, else from GGA, else from GNS; what GGK
 does not say (HDOP, separation, age, station) comes from the GGA or GNS of its epoch. A GST that comes too late or less
-often than the position serves the next fixes of the same quality for 1.5 s. VTG has no time: its course and speed go
-with the fix that is given out next, at most 1.5 s later.
+often than the position serves the next fixes of the same quality for 1.5 s. VTG has no time: inside
+an epoch its course and speed are the epoch's. Behind one that has ended it is that one's too, and too late, unless it
+arrived nearer to the sentence that begins the next (a receiver that sends VTG first).
 
 **Headings.** Never wait and never hold a fix up. AVR has a time. HDT and THS have none: the first one that stands
 behind a sentence with a new time belongs to that time's epoch, further ones (a compass may be faster than the
@@ -167,6 +168,9 @@ class NmeaCodec:
         self._gst_last: tuple[int, int, float, float, float] | None = None  # key, quality, e, n, u
         self._dop: tuple[int, float, float] | None = None  # arrival_ns, pdop, vdop
         self._velocity: tuple[int, float, float] | None = None  # arrival_ns, course, speed; until a fix takes it
+        self._between = -1  # arrival of what ended the epoch before the VTG that waits; -1 = none waits, or inside one
+        self._now = -1  # arrival of the sentence in hand
+        self._ended = -1  # arrival of what ended the last epoch
         self._heading_key = _EMPTY  # the epoch that has its heading
         self._heading_rank = 0
         self._heading_beside = 0
@@ -331,6 +335,7 @@ class NmeaCodec:
             if said == right:
                 if handler is not None:
                     fields = body.decode("ascii").split(",")
+                    self._now = t_ns
                     try:
                         handler(fields[0][:2], fields, t_ns, hint_ns, out)
                     except BadSentenceError as e:
@@ -515,6 +520,7 @@ class NmeaCodec:
     def _on_vtg(self, talker: str, f: list[str], t_ns: int, hint_ns: int, out: Output) -> None:
         need_fields("VTG", f, 9, 10)
         self._velocity = (t_ns, *velocity(f))
+        self._between = -1 if self._open or self._ended < 0 else self._ended
 
     def _on_hdt(self, talker: str, f: list[str], t_ns: int, hint_ns: int, out: Output) -> None:
         need_fields("HDT", f, 2, 3)
@@ -588,6 +594,10 @@ class NmeaCodec:
             self._history = [*self._history[-2:], self._last_kind]
             same = len(self._history) == 3 and len(set(self._history)) == 1
             self._ender = self._last_kind if same else ""
+        if self._between >= 0 and self._velocity is not None:
+            if self._velocity[0] - self._between <= self._now - self._velocity[0]:
+                self._velocity = None  # of the epoch before
+            self._between = -1
         self._open = True
         self._key = tod
         self._kinds = {kind: talker}
@@ -607,6 +617,7 @@ class NmeaCodec:
     def _close(self, out: Output) -> None:
         """End the open epoch; give its fix, if it has a position sentence, and the Events that come with it."""
         self._open = False
+        self._ended = self._now
         pos = self._placement()
         if pos is None:
             return
@@ -794,6 +805,8 @@ class NmeaCodec:
             "gst_last": _list(self._gst_last),
             "dop": _list(self._dop),
             "velocity": _list(self._velocity),
+            "between": self._between,
+            "ended": self._ended,
             "heading": [self._heading_key, self._heading_rank, self._heading_beside],
             "separation": [self._separation, self._separation_missing],
             "coarse": [self._coarse, self._coarse_run],
@@ -824,6 +837,7 @@ class NmeaCodec:
         self._gst_last = None if s["gst_last"] is None else tuple(s["gst_last"])
         self._dop = None if s["dop"] is None else tuple(s["dop"])
         self._velocity = None if s["velocity"] is None else tuple(s["velocity"])
+        self._between, self._ended = s.get("between", -1), s.get("ended", -1)  # not in states before 2026-12
         self._heading_key, self._heading_rank, self._heading_beside = s["heading"]
         self._separation, self._separation_missing = s["separation"]
         self._coarse, self._coarse_run = s["coarse"]

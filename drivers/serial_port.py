@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import queue
 import select
@@ -187,6 +188,12 @@ class SerialPort:
             if not parts:
                 raise OSError(errno.EIO, "the other end closed the connection")
         return b"".join(parts)
+
+    def let_go(self) -> None:
+        """While a read of another thread hangs: the device may be opened again, though `close` would wait in vain."""
+        if self._fd >= 0:
+            with contextlib.suppress(OSError):
+                fcntl.flock(self._fd, fcntl.LOCK_UN)
 
     def close(self, silently: bool = False) -> None:
         """Idempotent, never raises; never says anything to the device."""

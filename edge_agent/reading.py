@@ -75,10 +75,20 @@ class Reader(threading.Thread):
         self.source, self.port, self.inbox, self.account, self.stopping = name, port, inbox, account, stop
         self.failure: BaseException | None = None
         self.reopen = threading.Event()
-        self.abandoned = False  # another reader has taken over
+        self.abandoned = False  # another reader has taken over: from then on nothing more is said to the device
         self.state = "START"  # OPEN, LOST
         self.busy_ns = 0  # a call into the driver began then; 0 = none is under way
         self._now = now
+        self._turn = threading.Lock()  # between the begin of a call into the driver and `abandon`
+
+    def abandon(self) -> bool:
+        """Give the port to another reader, if this one still hangs; whether it does."""
+        with self._turn:
+            if self.busy_ns and self._now() - self.busy_ns > HUNG_S * m.S:
+                self.abandoned = True
+                if let_go := getattr(self.port, "let_go", None):  # of drivers that hold a device against others
+                    let_go()
+            return self.abandoned
 
     def run(self) -> None:
         try:
@@ -89,25 +99,27 @@ class Reader(threading.Thread):
 
     def _run(self) -> None:
         wait = BACKOFF_S[0]
-        while not (self.stopping.is_set() or self.abandoned):
+        while not self.stopping.is_set():
             try:
                 self.reopen.clear()
-                self.busy_ns = self._now()
+                if not self._begin():
+                    break
                 self.port.open()
+                if self.abandoned:
+                    break
                 if self.state == "LOST":
                     self._fault("PORT_OPEN", "open again")
                 self.state = "OPEN"
-                while not (self.stopping.is_set() or self.abandoned or self.reopen.is_set()):
-                    self.busy_ns = self._now()
+                while not (self.stopping.is_set() or self.reopen.is_set()) and self._begin():
                     for t_ns, payload in self.port.read():
                         self._offer(t_ns, payload)
                         wait = BACKOFF_S[0]
-                if self.reopen.is_set():
-                    self.account.reopened += 1
-                    self.port.close()
+                if self.stopping.is_set() or not self._begin():
+                    break
+                self.account.reopened += 1
+                self.port.close()
             except drivers.PortError as e:
                 self._close()
-                self.busy_ns = 0
                 if self.abandoned:
                     return  # the port is another reader's, and so is its state
                 self.state = "LOST"
@@ -115,13 +127,17 @@ class Reader(threading.Thread):
                 self.stopping.wait(wait)
                 wait = min(2 * wait, BACKOFF_S[1])
         self._close()
-        self.busy_ns = 0
+
+    def _begin(self) -> bool:
+        """A call into the driver begins, unless the port is another reader's by now."""
+        with self._turn:
+            self.busy_ns = self._now()
+            return not self.abandoned
 
     def _close(self) -> None:
-        if self.abandoned:
-            self.port.close(silently=True)  # the device is another reader's
-        else:
-            self.port.close()
+        mine = self._begin()
+        self.port.close(silently=not mine)  # what another reader holds is let go without a word
+        self.busy_ns = 0
 
     def _offer(self, t_ns: int, payload: Payload) -> None:
         size = payload_size(payload)

@@ -19,7 +19,6 @@ stand in `RecordSettings`.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import platform
 import signal
@@ -39,6 +38,7 @@ import drivers
 from edge_agent import assemble, lock
 from edge_agent import messages as m
 from edge_agent import status as st
+from edge_agent.memory import steady_memory
 from edge_agent.notify import Notifier
 from edge_agent.observe import Observer, Publisher, resident_bytes
 from edge_agent.pipeline import Pipeline
@@ -67,12 +67,11 @@ STATE_FILE = "state/kept.bin"
 READERS_S = 5.0  # at a stop, what all readers together may take to come back from their drivers
 CLIPS_S = 10.0  # at a stop, what clips may still take
 RESERVE_BYTES = MB  # of the outbox beyond its bound, for Ticks and for what tells of the loss
-M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8  # of malloc.h
 LOSSES_S = 60.0  # how often stderr is told of losses that go on
 HEAD_RECORDS = 64  # Ticks, faults and diagnostics that wait for the first data; then the first file begins without
 
 INFO, WARNING, ERROR = 20, 30, 40
-GOOD_NEWS = ("PORT_OPEN", "OK", "DISK_OK", "WRITER_OK", "STATUS_OK", "CLIP")
+GOOD_NEWS = ("PORT_OPEN", "OK", "DISK_OK", "WRITER_OK", "STATUS_OK", "FSYNC_OK", "CLIP")
 
 
 class Agent:
@@ -170,7 +169,7 @@ class Agent:
         if self.writer.failure is not None:
             raise self.writer.failure
         sensors = [a for name, a in self.accounts.items() if name != "clock"]
-        if any(a.received for a in sensors) and not any(a.written for a in sensors):
+        if any(a.refused or a.dropped or a.lost for a in sensors) and not any(a.written for a in sensors):
             self._print("nothing that came could be recorded")
             return 1
         return 3 if any(topic.startswith("/raw/") for topic in self.writer.lost) else 0
@@ -432,9 +431,10 @@ class Agent:
         self._abandoned = [r for r in self._abandoned if r.is_alive()]
         if self._make_port is None or sum(r.source == port for r in self._abandoned) >= HUNG_MOST:
             return
+        if not reader.abandon():
+            return  # it has come back just now
         text = f"its driver has been in one call for {HUNG_S:.0f} s; another reader takes over"
         self.fault(m.Fault(t_ns, port, "PORT_HUNG", text))
-        reader.abandoned = True
         self._abandoned.append(reader)
         fresh = Reader(port, self._make_port(port), self.inbox, self.accounts[port], self.stop, self._now)
         fresh.state = "LOST"  # until it is open
@@ -527,6 +527,8 @@ class Agent:
             "disk_free_bytes": str(self.writer.disk.free_bytes),
             "writer_stalled_s": f"{self._stalled_s:.0f}",
             "writer_stalls": str(self._stalls),
+            "fsync_s": f"{self.recorder.fsync_ns / m.S:.3f}",
+            "fsyncs_late": str(self.recorder.fsyncs_late),
             "rss_bytes": str(resident_bytes()),
             "clock_sync": str(int(wall.sync)),
             "clock_error_ns": str(wall.error_ns),
@@ -683,17 +685,6 @@ def run_metadata(config: m.Config, run_id: str) -> dict[str, str]:
         "started_utc_ns": str(time.time_ns()),
         "boot": boot_id(),
     }
-
-
-def steady_memory() -> None:
-    """Tell glibc's malloc to keep one arena and to give large blocks back. By default each thread has an arena, which
-    grows to what the hungriest of all threads that ever used it needed (7 MiB in 18 hours of a soak in which readers
-    were replaced), and blocks of the size of a chunk move into the heap for good. The interpreter's lock leaves threads
-    nothing to gain from arenas. Another C library: nothing happens."""
-    with suppress(OSError, AttributeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(M_ARENA_MAX, 1)
-        mallopt(M_MMAP_THRESHOLD, 256 << 10)
 
 
 def run(config: m.Config) -> int:

@@ -15,6 +15,7 @@ port lost   the device was away
 stall       the agent itself stood still (SIGSTOP, a machine at its end): what devices sent meanwhile may be gone
 silent      the port was open and nothing came
 missing     a file of the run is not here
+damaged     it stood in a file that is damaged or cut off
 unknown     nothing in the recording explains it
 
 Event clips (`clips/` in a folder) are read too: each must be whole and as it was written; they have no chain.
@@ -151,17 +152,37 @@ def verify(
 
 def judged(files: list[File], notes: list[str], clips: Sequence[File] = ()) -> Verdict:
     """The verdict on files that have been looked at."""
-    verdict = Verdict(_in_order(files), notes=notes, clips=list(clips))
-    for f in verdict.clips + verdict.files:
+    once, copies = _once(files)
+    verdict = Verdict(_in_order(once), notes=notes + [text for _, text in copies], clips=list(clips))
+    for f in (*verdict.clips, *verdict.files, *(f for f, _ in copies)):
         if f.damage:
             verdict.wanting.append(f"{f.path}: {f.damage}")
         if f.state == "repaired":
             verdict.notes.append(f"{f.path.name} was torn and has been repaired, {f.lost_bytes} bytes were cut off")
-        if f.state == "open":
+        if f.messages and not f.raws and not f.run and not f.damage:
+            verdict.notes.append(f"{f.path.name} holds no raw data: of another program, or a part of a recording")
+        if f.state == "open" and not f.size:
+            verdict.notes.append(f"{f.path.name} is empty: it is being made, or its agent was killed then (`recover`)")
+        elif f.state == "open":
             verdict.notes.append(f"{f.path.name} has no index: it is being written, or was torn (`recover`)")
     _chain(verdict)
     _gaps(verdict)
     return verdict
+
+
+def _once(files: Sequence[File]) -> tuple[list[File], list[tuple[File, str]]]:
+    """Files whose records count; and those whose do not, with why: named twice, or replayed from others here."""
+    names = {f.name for f in files}
+    seen: dict[str, File] = {}
+    copies = []
+    for f in files:
+        first = seen.setdefault(f.sha256 or str(f.path), f)
+        source = f.run.get("replayed_from", "")
+        if first is not f and f.messages:
+            copies.append((f, f"{f.path} is the same as {first.path}: counted once"))
+        elif source and f.name not in source.split(", ") and names.issuperset(source.split(", ")):
+            copies.append((f, f"{f.path.name} is a replay of {source}: its records are not counted again"))
+    return [f for f in files if all(f is not copy for copy, _ in copies)], copies
 
 
 def _is_damaged(name: str) -> bool:
@@ -180,6 +201,8 @@ def look(path: Path) -> File:
             f.size = file.tell()
         if f.size == 0:
             f.state = "open"  # killed as it was made
+            if not path.name.endswith(PART):
+                f.state, f.damage = "damaged", "is empty (0 bytes): not a recording; a copy that failed, or a sick disk"
             return f
         metadata = reader.read_metadata(path)
         f.run = metadata.get(RUN_METADATA, {})
@@ -405,7 +428,8 @@ def _within_run(a: File, b: File, at_disk: Sequence[tuple[int, int]]) -> list[Ga
         text = f"{count} raw blocks between {a.path.name} and {b.path.name} are in no file"
         if not any(x <= begin and y >= end for x, y in at_disk):
             disk = b.run.get("opened_because") == "disk"
-            found.append(Gap(end, begin, "all", "disk" if disk else "unknown", text))
+            reason = "damaged" if a.damage or a.state == "open" else "disk" if disk else "unknown"
+            found.append(Gap(end, begin, "all", reason, text))
     if b.run.get("opened_because") == "clock":
         return found  # other times from here on
     for port, last in a.last_ns.items():  # quiet over the border

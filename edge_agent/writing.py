@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from edge_agent import messages as m
+from edge_agent.memory import give_back
 from edge_agent.notify import Notifier
 from edge_agent.queues import ByteQueue
 from edge_agent.reading import RECORD_OVERHEAD, Account
@@ -176,6 +177,7 @@ class Writer(threading.Thread):
             return not self.holding
         if isinstance(item, m.Rotate):
             self._begin_utc_ns = item.utc_ns
+            give_back()
         elif account := self._account(item):
             account.written += 1
         return True

@@ -147,8 +147,8 @@ install() {
     else
         say "files below $ROOT:"
     fi
-    for file in install.sh edge-agent.service network.conf 80-can0.network 80-edge-agent.rules edge-agent.modules \
-        edge-agent.sysctl example.yaml example.dbc; do
+    for file in install.sh edge-agent.service network.conf data-dir.conf 80-can0.network 80-edge-agent.rules \
+        edge-agent.modules edge-agent.sysctl example.yaml example.dbc; do
         put $file $OPT/share/$file
     done
     chmod 0755 "$ROOT$OPT/share/install.sh"

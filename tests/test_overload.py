@@ -97,7 +97,7 @@ def test_a_writer_that_stalls_for_30_s_loses_nothing_with_the_default_bounds(scr
     sound(run)
     assert estimates(run.files()) == estimates(calm.files())
     assert [(r.source, r.t_ns) for r in raws(run.files())] == [(r.source, r.t_ns) for r in script]
-    assert [f["kind"] for f in faults(run.files())] == ["WRITER_STALLED", "WRITER_OK"]
+    assert [f["kind"] for f in faults(run.files())] == ["WRITER_STALLED", "FSYNC_LATE", "WRITER_OK"]
     assert values(faults(run.files(), "WRITER_OK")[0])["stalled_s"] == 30
     assert run.most["outbox"] * 10 < run.agent.outbox.limit_bytes * DERIVED_SHARE
 

@@ -241,7 +241,7 @@ class Flaky:
             raise PortError("unplugged")
         return [(1, self.reads.pop(0))]
 
-    def close(self) -> None:
+    def close(self, silently: bool = False) -> None:
         self.closed += 1
 
 

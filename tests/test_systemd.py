@@ -58,14 +58,14 @@ def run(*command: str | Path, **env: str) -> subprocess.CompletedProcess[str]:
 # ---------------------------------------------------------------------------------------------------------------- unit
 
 
-def complaints(folder: Path, unit: str, drop_in: str | None = None) -> list[str]:
+def complaints(folder: Path, unit: str, drop_in: str | None = None, name: str = "network.conf") -> list[str]:
     """What systemd has to say about a unit file and a drop-in; not what it says of the machine's own units."""
     path = folder / UNIT.name
     # the agent's program is not installed here
     path.write_text(unit.replace("/opt/edge-agent/venv/bin/edge-agent", shutil.which("true") or "/bin/true"))
     if drop_in is not None:
         (folder / f"{UNIT.name}.d").mkdir(exist_ok=True)
-        (folder / f"{UNIT.name}.d" / "network.conf").write_text(drop_in)
+        (folder / f"{UNIT.name}.d" / name).write_text(drop_in)
     done = run(tool("systemd-analyze"), "verify", "--man=no", path)
     return [line for line in (done.stdout + done.stderr).splitlines() if "edge-agent" in line]
 
@@ -82,6 +82,15 @@ def test_the_drop_in_for_network_sources_is_good_too(tmp_path: Path) -> None:
     drop_in = (SYSTEMD / "network.conf").read_text()
     assert complaints(tmp_path, UNIT.read_text(), drop_in) == []
     assert complaints(tmp_path, UNIT.read_text(), drop_in.replace("IPAddressAllow=", "IPAdressAllow="))
+
+
+def test_the_drop_in_for_recordings_elsewhere_is_good_and_asks_for_no_folder_that_is_not_there(tmp_path: Path) -> None:
+    drop_in = (SYSTEMD / "data-dir.conf").read_text()
+    assert complaints(tmp_path, UNIT.read_text(), drop_in, "data-dir.conf") == []
+    assert complaints(tmp_path, UNIT.read_text(), drop_in.replace("ReadWritePaths", "ReadWritePath"), "data-dir.conf")
+    (paths,) = re.findall(r"^ReadWritePaths=(.*)$", drop_in, re.MULTILINE)
+    assert paths.startswith("-/")  # without the dash the service could not start at all: code 226, for ever
+    assert "data-dir.conf" in UNIT.read_text()
 
 
 def test_exposure_is_at_most_two() -> None:

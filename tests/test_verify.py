@@ -109,6 +109,47 @@ def test_two_runs_that_were_stopped_are_good(tmp_path: Path, capsys: pytest.Capt
     assert main(["verify", str(tmp_path / "empty")]) == 2
 
 
+def test_an_empty_file_is_named_with_its_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = three(tmp_path)
+    (tmp_path / "site_20260601T090000Z_000.mcap.part").touch()
+    assert code(tmp_path, capsys)[0] == 0  # an agent makes its next file so
+    (note,) = verify([tmp_path]).notes
+    assert note.startswith("site_20260601T090000Z_000.mcap.part is empty: it is being made")
+    empty = tmp_path / "site_20260601T100000Z_000.mcap"
+    empty.touch()
+    found, said = code(tmp_path, capsys)
+    assert found == 1
+    assert said["wanting"] == [
+        f"{empty}: is empty (0 bytes): not a recording; a copy that failed, or a sick disk",
+    ]
+    assert {f["file"]: f["state"] for f in said["files"]}[str(empty)] == "damaged"
+    assert main(["verify", str(empty)]) == 1
+    assert "is empty (0 bytes)" in capsys.readouterr().out
+    assert files[0].exists()
+
+
+def test_what_is_named_twice_or_was_replayed_from_the_rest_is_counted_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = three(tmp_path)
+    alone = code(tmp_path, capsys)[1]
+    again = verify([tmp_path, files[1], files[1]])
+    assert as_json(again) == {**alone, "notes": [f"{files[1]} is the same as {files[1]}: counted once"] * 2}
+    metadata = {"run": "r1", "segment": "0", "replayed_from": ", ".join(p.name for p in files)}
+    writer = SegmentWriter(tmp_path / "fused.mcap.part", metadata=metadata, attachments={})
+    for path in files:
+        for s in reader.read_messages(path, {"/raw/gnss", "/raw/can", "/raw/clock"}):
+            writer.add(Record(s.topic, s.log_ns, s.publish_ns, s.data, False, s.schema))
+    fused = writer.close()
+    found, said = code(tmp_path, capsys)
+    assert found == 0
+    names = ", ".join(p.name for p in files)
+    assert said == {**alone, "notes": [f"fused.mcap is a replay of {names}: its records are not counted again"]}
+    assert verify([fused]).files[0].raws == {"gnss": 180, "can": 180, "clock": 180}  # alone it is what there is
+    fused.write_bytes(fused.read_bytes()[:300] + b"x" + fused.read_bytes()[301:])
+    assert code(tmp_path, capsys)[0] == 1  # but must be whole
+
+
 def test_a_changed_byte_and_a_rewritten_file_are_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = three(tmp_path)
     good = files[1].read_bytes()

@@ -10,7 +10,8 @@ A clip's metadata names its triggers and the segments that it was taken from. Th
 amid a segment, without a checkpoint, so `replay` computes it anew from its raw data.
 
 A run that ended without an orderly stop (a kill, a power cut) may have left events without their clip. The next start
-finds them in the last files before it, as the dead run's own Watch would have, and makes up for them.
+finds them in the last files before it, as the dead run's own Watch would have, and makes up for them. A clip is known
+by its run and its monotonic begin, for the UTC in its name depends on the file that it was computed with.
 
 Retention never deletes clips; beyond `clips_gb` new ones are refused, and a fault says so (the segments still hold the
 data). The hook is run without a shell, in a process group of its own that is killed after `hook_s`; it holds none of
@@ -33,16 +34,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from edge_agent.messages import EventSettings, Fault, Record, S, TriggerSettings
+from edge_agent.messages import MS, EventSettings, Fault, Record, S, TriggerSettings
 from edge_agent.recording import topics
 from edge_agent.recording.reader import (
     Stored,
+    count,
+    has_metadata,
     head_metadata,
     newest_ns,
     read_attachments,
     read_between,
     read_messages,
-    read_metadata,
 )
 from edge_agent.recording.repair import REPAIRED_METADATA
 from edge_agent.recording.segments import Recorder, list_segments
@@ -60,6 +62,8 @@ HOOK_OOM = 500
 """Score by which the kernel chooses whom to kill for memory; the service's own is -500."""
 OF_A_SEGMENT = ("segment", "opened_because", "previous_name", "previous_sha256")
 """What a file's metadata say of its place among the others, which a clip has not."""
+BEGIN_KEY = "clip_begin_monotonic_ns"
+"""Of a clip's metadata."""
 PATIENCE_S = 30.0
 """How long a clip waits for its last records to reach the disk."""
 
@@ -212,7 +216,7 @@ class Clips(threading.Thread):
         except (OSError, ValueError, OverflowError) as e:
             self._tell("CLIP_FAILED", f"{', '.join(job.names)}: {e}; the segments hold the data")
             return
-        values = (("seconds", seconds), ("bytes", float(size)))
+        values = (("seconds", seconds), ("bytes", float(size)), ("begin_monotonic_s", job.begin_ns / S))
         self._tell("CLIP", f"{path.name}: {seconds:.1f} s, {', '.join(job.names)}", values)
         if self.settings.hook and not self.stopping.is_set() and (said := self._hook(path, job)):
             self._tell("HOOK_FAILED", f"{self.settings.hook[0]}: {said}")
@@ -248,13 +252,14 @@ class Clips(threading.Thread):
         utc_ns = max(0, job.begin_ns + sources[0][1])
         run, attachments = self.recorder.metadata, self.recorder.attachments
         if job.files:
-            told = read_metadata(sources[-1][0]).get(RUN_METADATA, {})
+            told = head_metadata(sources[-1][0], RUN_METADATA)
             run = {k: v for k, v in told.items() if k not in OF_A_SEGMENT}
             attachments = {a.name: a.data for a in read_attachments(sources[-1][0])}
         metadata = {
             **run,
             "site": self.recorder.site,
             "clip": ", ".join(job.names),
+            BEGIN_KEY: str(job.begin_ns),
             "clip_of": ", ".join(path.name.removesuffix(PART) for path, _ in sources),
         }
         part = self._free_name(utc_ns)
@@ -328,46 +333,67 @@ def left_over(
             continue
         try:
             name = head_metadata(segment.path, RUN_METADATA).get("run", "")
+            if name == run or (len(runs) == RUNS_BACK and name not in runs) or oldest.get(name) == TIME_MAX:
+                continue
+            if name not in runs and _is_whole(segment.path):
+                runs[name], oldest[name] = [], TIME_MAX  # this run ended in order
+                continue
             end_ns = newest_ns(segment.path)
         except (OSError, ValueError, OverflowError):  # retention was quicker; the others may hold something
             continue
-        if name == run or (len(runs) == RUNS_BACK and name not in runs):
-            continue
-        if not runs.setdefault(name, []) and _is_whole(segment.path):
-            oldest[name] = TIME_MAX  # this run ended in order
         if end_ns >= oldest.setdefault(name, end_ns - lookback):
-            runs[name].insert(0, segment.path)
-    made = [path.name for path in (data_dir / FOLDER).glob("*.mcap") if _is_whole(path)]
-    for files in (some for some in reversed(runs.values()) if some):
-        yield from _without_clip(tuple(files), site, settings, of_fault, made)
+            runs.setdefault(name, []).insert(0, segment.path)
+    for name, files in reversed(runs.items()):
+        if files and (missing := _asked_for(tuple(files), site, settings, of_fault)):
+            made = _made(data_dir / FOLDER, name)  # thousands of files on a slow card: only where it matters
+            for job, stems in missing:
+                if not _is_among(made, job, stems):
+                    yield job
+
+
+def _made(folder: Path, run: str) -> list[tuple[str, float | None]]:
+    """Name and monotonic begin [ns] of a run's clips that are whole; None = written before clips said it."""
+    found: list[tuple[str, float | None]] = []
+    for path in folder.glob("*.mcap"):
+        with suppress(OSError, ValueError, OverflowError):  # moved away meanwhile, or damaged
+            told = head_metadata(path, RUN_METADATA)
+            if told.get("run", "") == run and _is_whole(path):
+                found.append((path.name, count(told[BEGIN_KEY]) if BEGIN_KEY in told else None))
+    return found
+
+
+def _is_among(clips: Iterable[tuple[str, float | None]], job: Job, stems: tuple[str, ...]) -> bool:
+    """Whether one of a run's clips is that of the job."""
+    return any(
+        name.startswith(stems) if begin_ns is None else abs(begin_ns - job.begin_ns) < MS for name, begin_ns in clips
+    )
 
 
 def _is_whole(path: Path) -> bool:
     """Whether a recording was finished by the run that wrote it."""
     try:
-        return REPAIRED_METADATA not in read_metadata(path)
+        return not has_metadata(path, REPAIRED_METADATA)
     except (OSError, ValueError, OverflowError):
         return False
 
 
-def _without_clip(
-    files: tuple[Path, ...],
-    site: str,
-    settings: EventSettings,
-    of_fault: Mapping[str, Sequence[str]],
-    made: Sequence[str],
-) -> Iterator[Job]:
-    """What a run's own Watch would have asked for, as far as it has not been written."""
+def _asked_for(
+    files: tuple[Path, ...], site: str, settings: EventSettings, of_fault: Mapping[str, Sequence[str]]
+) -> list[tuple[Job, tuple[str, ...]]]:
+    """What a run's own Watch would have asked for, as far as the run does not say that it has written it; each with the
+    begins of names that its clip can have."""
     watch = Watch(settings)
-    found: list[tuple[Job, int]] = []  # with UTC - monotonic
+    found: list[Job] = []
     offset = now_ns = 0
-    told: list[str] = []  # clips that the run says it has written
+    offsets: dict[int, None] = {}  # UTC - monotonic of each file
+    told: list[tuple[str, float | None]] = []  # clips that the run says it has written
     stopped = False
     for path in files:
         for s in read_messages(path, {topics.CHECKPOINT_TOPIC, "/events", "/faults", "/rosout"}):
             if s.topic == topics.CHECKPOINT_TOPIC:
                 point = topics.decode_checkpoint(s.data)
                 offset, now_ns = point.utc_ns - point.monotonic_ns, max(now_ns, point.monotonic_ns)
+                offsets[offset] = None
                 continue
             message = topics.decode(s.schema, s.data)
             now_ns = max(now_ns, s.log_ns - offset)
@@ -375,22 +401,25 @@ def _without_clip(
                 stopped = message["msg"] == "stopped"
                 continue
             if job := watch.due(now_ns):
-                found.append((job, offset))
+                found.append(job)
             if s.topic == "/events":
                 take(watch, message, offset)
             elif message["kind"] == "CLIP":
-                told.append(message["text"])
+                begin_s = next((v["value"] for v in message["values"] if v["name"] == "begin_monotonic_s"), None)
+                told.append((message["text"], None if begin_s is None else begin_s * S))
             else:
                 for name in of_fault.get(message["kind"], ()):
                     watch.moment(name, message["monotonic_ns"])
     if stopped:
-        return
+        return []
     now_ns = max(now_ns, newest_ns(files[-1]) - offset) + 1  # an end is exclusive
-    found += [(job, offset) for job in (watch.due(now_ns), watch.rest(now_ns)) if job is not None]
-    for job, of in found:
-        stem = _stem(site, max(0, job.begin_ns + of))
-        if not any(name.startswith(stem) for name in (*made, *told)):
-            yield Job(job.begin_ns, job.end_ns, job.names, files)
+    found += [job for job in (watch.due(now_ns), watch.rest(now_ns)) if job is not None]
+    asked = []
+    for job in found:
+        stems = tuple(_stem(site, max(0, job.begin_ns + of)) for of in offsets)
+        if not _is_among(told, job, stems):
+            asked.append((Job(job.begin_ns, job.end_ns, job.names, files), stems))
+    return asked
 
 
 def take(watch: Watch, event: Mapping[str, Any], offset_ns: int) -> None:

@@ -2,7 +2,8 @@
 
 The walk is over records, not over the summary, so a file without its footer reads like a whole one up to its last whole
 chunk. Every chunk's CRC is checked (libraries do not by default). A tail that was cut ends the walk in silence; damage
-with more of the file behind it raises DamagedError, for what follows would be out of its context.
+with more of the file behind it raises DamagedError, for what follows would be out of its context. Messages that another
+version wrote are given as today's (`older`).
 """
 
 from __future__ import annotations
@@ -10,19 +11,21 @@ from __future__ import annotations
 import mmap
 import struct
 import zlib
-from collections.abc import Container, Generator, Iterator
+from collections.abc import Callable, Container, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
+import numpy as np
+import numpy.typing as npt
 import zstandard
 
-from edge_agent.recording import topics
+from edge_agent.recording import older, topics
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 1, 2, 3, 4, 5, 6, 7
-ATTACHMENT, METADATA, DATA_END = 9, 12, 15
+ATTACHMENT, STATISTICS, METADATA, METADATA_INDEX, DATA_END = 9, 11, 12, 13, 15
 CHUNK_MAX = 1 << 30
 """No chunk that this program or a sane one writes is larger unpacked; a damaged length must not fill the memory."""
 
@@ -35,6 +38,17 @@ _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
 _MESSAGE = struct.Struct("<HIQQ")
 _WHOLE_MESSAGE = struct.Struct("<BQHIQQ")  # with its record's head
+_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_ns", "<u8"),
+        ("publish_ns", "<u8"),
+    ]
+)
+"""The same, of many at once."""
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")
@@ -185,16 +199,38 @@ class Channels:
             self.channels[number] = topic, schema
         self.records[part.opcode, number] = buffer[part.pos - _RECORD.size : end]
 
+    def named(self, channel: int) -> tuple[str, str]:
+        """Topic and schema of a channel. KeyError where its file does not define both."""
+        topic, schema = self.channels[channel]
+        return topic, self.schemas[schema][0] if schema else ""
+
+    def converter(self, channel: int) -> Callable[[bytes], bytes] | None:
+        """What makes today's message of one of a channel; None where it is. KeyError as `named`."""
+        schema = self.channels[channel][1]
+        return older.converter(*self.schemas[schema]) if schema else None
+
+    def are_todays(self, channels: set[int]) -> bool:
+        """Whether all of them are known, and none is of another version."""
+        return channels <= self.channels.keys() and all(self.converter(c) is None for c in channels)
+
     def message(self, buffer: Buffer, part: Part) -> Stored:
         """A message record. DamagedError without its channel."""
         end = part.pos + part.length
         channel, sequence, log_ns, publish_ns = _numbers(_MESSAGE, buffer, part.pos, end)
         try:
-            topic, schema = self.channels[channel]
-            name = self.schemas[schema][0] if schema else ""
+            topic, name = self.named(channel)
         except KeyError:
             raise DamagedError(f"message at byte {part.pos}: its channel {channel} is not in the file") from None
-        return Stored(topic, name, log_ns, publish_ns, sequence, buffer[part.pos + _MESSAGE.size : end])
+        data = _today(self.converter(channel), buffer[part.pos + _MESSAGE.size : end], part.pos)
+        return Stored(topic, name, log_ns, publish_ns, sequence, data)
+
+
+def _today(convert: Callable[[bytes], bytes] | None, data: bytes, pos: int) -> bytes:
+    """A message as this version would have written it. DamagedError."""
+    try:
+        return data if convert is None else convert(data)
+    except ValueError as e:
+        raise DamagedError(f"message at byte {pos}: {e}") from None
 
 
 def _check_magic(buffer: Buffer, path: Path) -> None:
@@ -229,11 +265,14 @@ def read_messages(path: Path, wanted: Container[str] | None = None, tally: Tally
         yield from _messages(buffer, Channels(), wanted, tally or Tally())
 
 
+Named: TypeAlias = dict[int, tuple[str, str, bool, Callable[[bytes], bytes] | None]]
+
+
 def _in_chunk(
-    data: bytes, known: Channels, wanted: Container[str] | None, named: dict[int, tuple[str, str, bool]], tally: Tally
+    data: bytes, known: Channels, wanted: Container[str] | None, named: Named, tally: Tally
 ) -> Generator[Stored, None, int]:
     """Messages of an unpacked chunk; returns how far its records reach. `named`: channel -> topic, schema, whether it
-    is wanted, as far as met. This loop is where a walk spends its time."""
+    is wanted, what makes it today's, as far as met. This loop is where a walk spends its time."""
     unpack, size = _WHOLE_MESSAGE.unpack_from, _WHOLE_MESSAGE.size
     pos, end = 0, len(data)
     count, low, high = 0, 1 << 64, 0
@@ -255,15 +294,17 @@ def _in_chunk(
                 break
             if channel not in named or pos < begin:
                 first = known.message(data, Part(MESSAGE, begin - _MESSAGE.size, length))
-                named[channel] = first.topic, first.schema, wanted is None or first.topic in wanted
+                yes = wanted is None or first.topic in wanted
+                named[channel] = first.topic, first.schema, yes, known.converter(channel)
             count += 1
             if log_ns > high:
                 high = log_ns
             if log_ns < low:
                 low = log_ns
-            topic, schema, yes = named[channel]
+            topic, schema, yes, convert = named[channel]
             if yes:
-                yield Stored(topic, schema, log_ns, publish_ns, sequence, data[begin:pos])
+                body = data[begin:pos] if convert is None else _today(convert, data[begin:pos], begin)
+                yield Stored(topic, schema, log_ns, publish_ns, sequence, body)
         for part in parts(data, pos):  # the last records, where they are shorter than a message's head
             if part.opcode == MESSAGE:
                 known.message(data, part)  # cut: raises
@@ -276,18 +317,132 @@ def _in_chunk(
     return pos
 
 
+class Rows(NamedTuple):
+    """Messages of a run of records in the order of the file: of each its channel, where its content stands in `data`,
+    its times UTC ns (n,); `named`: channel -> topic, schema."""
+
+    data: bytes
+    channel: npt.NDArray[np.int64]
+    begin: npt.NDArray[np.int64]
+    end: npt.NDArray[np.int64]
+    log_ns: npt.NDArray[np.int64]
+    publish_ns: npt.NDArray[np.int64]
+    named: dict[int, tuple[str, str]]
+
+
+def read_rows(path: Path) -> Iterator[Rows]:
+    """All messages of a file chunk by chunk, for who wants many of them: a message is a row of numbers, no object.
+    Raises as `read_messages`."""
+    with view(Path(path)) as buffer:
+        _check_magic(buffer, path)
+        known = Channels()
+        for part, indexes in _grouped(buffer):
+            if part.opcode in (SCHEMA, CHANNEL):
+                known.meet(buffer, part)
+            elif part.opcode == DATA_END:
+                return
+            elif part.opcode == MESSAGE:
+                yield _as_rows([known.message(buffer, part)])
+            elif part.opcode == CHUNK:
+                data = _sound(buffer, part)
+                if data is None:
+                    return
+                heads = _heads(buffer, data, indexes)
+                if heads is None or not known.are_todays(set(heads["channel"].tolist())):
+                    each = _in_chunk(data, known, None, {}, Tally())
+                    rows = _as_rows(list(_filling(each, part, data)))
+                    if len(rows.channel):
+                        yield rows
+                    continue
+                places, length = heads["begin"], heads["length"].astype(np.int64)
+                yield Rows(
+                    data,
+                    heads["channel"].astype(np.int64),
+                    places,
+                    places + length - _MESSAGE.size,
+                    heads["log_ns"].astype(np.int64),
+                    heads["publish_ns"].astype(np.int64),
+                    {c: known.named(c) for c in set(heads["channel"].tolist())},
+                )
+
+
+def _as_rows(stored: list[Stored]) -> Rows:
+    numbers = {name: i for i, name in enumerate(dict.fromkeys((s.topic, s.schema) for s in stored))}
+    ends = np.cumsum([len(s.data) for s in stored], dtype=np.int64)
+    return Rows(
+        b"".join(s.data for s in stored),
+        np.array([numbers[s.topic, s.schema] for s in stored], np.int64),
+        ends - np.array([len(s.data) for s in stored], np.int64),
+        ends,
+        np.array([s.log_ns for s in stored], np.int64),
+        np.array([s.publish_ns for s in stored], np.int64),
+        {i: name for name, i in numbers.items()},
+    )
+
+
+def _grouped(buffer: Buffer) -> Iterator[tuple[Part, list[Part]]]:
+    """Records of a file, each with the message indexes behind it."""
+    held: tuple[Part, list[Part]] | None = None
+    for part in parts(buffer):
+        if part.opcode == MESSAGE_INDEX:
+            if held is not None:
+                held[1].append(part)
+            continue
+        if held is not None:
+            yield held
+        held = part, []
+    if held is not None:
+        yield held
+
+
+def _sound(buffer: Buffer, part: Part) -> bytes | None:
+    """A chunk's records; None where it is damaged and the last thing that was written: a torn tail."""
+    try:
+        return chunk_data(buffer, chunk_head(buffer, part))
+    except DamagedError:
+        if next(parts(buffer, part.pos + part.length), None) is None:
+            return None
+        raise
+
+
+def _heads(buffer: Buffer, data: bytes, indexes: list[Part]) -> dict[str, npt.NDArray[Any]] | None:
+    """Heads of all records of a chunk at once, found by its message indexes; None where these do not lead from its
+    first byte to its last over nothing but messages. So they are never believed: what they say is what a walk from
+    record to record would have met."""
+    tables = []
+    for part in indexes:
+        if part.length < 6 or (part.length - 6) % 16 or part.pos + part.length > len(buffer):
+            return None
+        tables.append(buffer[part.pos + 6 : part.pos + part.length])
+    at = np.frombuffer(b"".join(tables), "<u8")[1::2]
+    size = _HEAD.itemsize
+    if not at.size or int(at.max()) > len(data) - size:
+        return None
+    place = np.sort(at.astype(np.int64))
+    head = np.frombuffer(data, np.uint8)[place[:, None] + np.arange(size)].view(_HEAD)[:, 0]
+    length = head["length"]
+    if (head["opcode"] != MESSAGE).any() or int(length.max()) > len(data) or int(length.min()) < _MESSAGE.size:
+        return None
+    behind = place + _RECORD.size + length.astype(np.int64)
+    if place[0] or behind[-1] != len(data) or (behind[:-1] != place[1:]).any():
+        return None
+    return {"begin": place + size, **{name: head[name] for name in _HEAD.names or ()}}
+
+
+def _filling(each: Generator[Stored, None, int], part: Part, data: bytes) -> Iterator[Stored]:
+    """Messages of a chunk. DamagedError where its records do not fill it."""
+    if (yield from each) != len(data):
+        raise DamagedError(f"chunk at byte {part.pos}: its records do not fill it")
+
+
 def _messages(buffer: Buffer, known: Channels, wanted: Container[str] | None, tally: Tally) -> Iterator[Stored]:
-    named: dict[int, tuple[str, str, bool]] = {}
+    named: Named = {}
     for part in parts(buffer):
         if part.opcode == CHUNK:
-            try:
-                data = chunk_data(buffer, chunk_head(buffer, part))
-            except DamagedError:
-                if next(parts(buffer, part.pos + part.length), None) is None:  # the last thing written: a torn tail
-                    return
-                raise
-            if (yield from _in_chunk(data, known, wanted, named, tally)) != len(data):
-                raise DamagedError(f"chunk at byte {part.pos}: its records do not fill it")
+            data = _sound(buffer, part)
+            if data is None:
+                return
+            yield from _filling(_in_chunk(data, known, wanted, named, tally), part, data)
         elif part.opcode == MESSAGE:
             stored = known.message(buffer, part)
             tally.add(1, stored.log_ns, stored.log_ns)
@@ -340,10 +495,27 @@ def _define(data: bytes, known: Channels) -> None:
             known.meet(data, part)
 
 
+def _summary(buffer: Buffer) -> list[Part]:
+    """Records of the index of a file, found from its end; [] where there is none, or it is damaged. On a slow card a
+    walk through all chunks takes a second and more, this a few reads."""
+    footer = len(buffer) - len(MAGIC) - 20
+    if footer < 2 * len(MAGIC) or buffer[footer + 20 :] != MAGIC:
+        return []
+    (start,) = _U64.unpack_from(buffer, footer)
+    (crc,) = _U32.unpack_from(buffer, footer + 16)
+    if not len(MAGIC) <= start < footer or crc != zlib.crc32(buffer[start : footer + 16]):
+        return []
+    return list(parts(buffer, start))
+
+
 def newest_ns(path: Path) -> int:
-    """The largest log time of a file by the heads of its chunks; 0 = none. Errors as `read_messages`."""
+    """The largest log time of a file by its index, else by the heads of its chunks; 0 = none. Errors as
+    `read_messages`."""
     with view(Path(path)) as buffer:
         _check_magic(buffer, path)
+        for part in _summary(buffer):
+            if part.opcode == STATISTICS and part.length >= 42:
+                return int(_U64.unpack_from(buffer, part.pos + 34)[0])
         return max((chunk_head(buffer, part).end_ns for part in parts(buffer) if part.opcode == CHUNK), default=0)
 
 
@@ -381,6 +553,17 @@ def read_metadata(path: Path) -> dict[str, dict[str, str]]:
         _check_magic(buffer, path)
         found = [parse_metadata(buffer, part) for part in parts(buffer) if part.opcode == METADATA]
     return dict(found)
+
+
+def has_metadata(path: Path, name: str) -> bool:
+    """Whether a file holds a metadata record of that name, by its index where it has one. Raises OSError,
+    DamagedError."""
+    with view(Path(path)) as buffer:
+        _check_magic(buffer, path)
+        indexed = [part for part in _summary(buffer) if part.opcode == METADATA_INDEX]
+        if indexed:
+            return name in [_text(buffer, part.pos + 16, part.pos + part.length)[0] for part in indexed]
+        return name in [parse_metadata(buffer, part)[0] for part in parts(buffer) if part.opcode == METADATA]
 
 
 def head_metadata(path: Path, name: str) -> dict[str, str]:

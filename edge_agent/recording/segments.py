@@ -3,9 +3,12 @@
 A `Rotate` closes the open segment and opens the next, whose first record is the Rotate's checkpoint; nothing else
 opens or closes one. Names are `<site>_<YYYYMMDDTHHMMSSZ>_<NNN>.mcap`, with `.part` behind while the file is open; NNN
 counts files of one second, so no two files ever share a name. Each file's metadata names the file before it and that
-file's SHA-256. Retention looks only at names of this form and this site: older than `keep_days` (by a disciplined clock
-only, that has run for hours without a step: one wrong step must not empty the disk), more than `keep_gb` together, less
-than `free_gb` free where deleting can reach that; it never touches the open file.
+file's SHA-256. An fsync takes at most three quarters of the time: after it comes a pause of a third of what it took.
+Where a slow disk makes a power cut cost more than `fsync_s` for that, FSYNC_LATE says so, and FSYNC_OK when it has kept
+up again for a minute. Retention looks only at names of this form and this site: older than `keep_days` (by a
+disciplined clock only, that has run for hours without a step: one wrong step must not empty the disk), more than
+`keep_gb` together, less than `free_gb` free where deleting can reach that, and else less than `FLOOR` of it; it never
+touches the open file.
 
 One thread drives a Recorder; time is an argument (monotonic ns). When the disk fails, the open file is sealed as far as
 it goes and RecordingError is raised; the Recorder then has no open file until the next Rotate.
@@ -35,6 +38,15 @@ PLAUSIBLE = datetime(2020, 1, 1, tzinfo=UTC)
 """Names before this come from a gateway whose clock had not been set; their age is not known."""
 HEAD_BYTES = 1 << 20
 """Free space without which no file is begun: head, checkpoint and an index."""
+FLOOR = 1 / 16
+"""So much of `free_gb` is kept free even where all of it cannot be: 62 MB by default, an hour of most sites. Without it
+the disk would run full again and again, and each time cost what is in the open chunk."""
+REST = 3
+"""The pause behind an fsync is what it took, divided by this: more would break the promise of `fsync_s` earlier."""
+LATE_NS = S // 2
+"""How much later than `fsync_s` an fsync may end before that is told."""
+KEPT_UP_NS = 60 * S
+"""After so long without a late one the disk is said to keep up again."""
 RECENT = 1000
 """Files of this run whose names are kept for event clips; an hour of them where a file lasts four seconds."""
 RETENTION_NS = 60 * S
@@ -113,7 +125,12 @@ class Recorder:
         self._since_ns: int | None = None  # since when the clock has gone on without a step, monotonic
         self._short = False  # of space that deleting cannot give, as told
         self._flushed_ns = self._synced_ns = self._pruned_ns = 0
-        self._ahead_ns = 0  # an fsync begins so much before it is due
+        self._ahead_ns = 0  # an fsync begins so much before it is due,
+        self._rest_ns = 0  # and not before this
+        self._covered_ns = 0  # what came until then is on the disk
+        self.fsync_ns = 0  # how long the last one took, with the records before it
+        self.fsyncs_late = 0  # ended later than promised, in this run
+        self._late_ns = 0  # the last of them; 0 = the disk keeps up, as told
 
     @property
     def path(self) -> Path | None:
@@ -155,12 +172,30 @@ class Recorder:
 
     @property
     def _fsync_due_ns(self) -> float:
-        return self._synced_ns + self.settings.fsync_s * S - self._ahead_ns
+        return max(self._synced_ns + self.settings.fsync_s * S - self._ahead_ns, self._rest_ns)
 
     def fsync_took(self, ns: int) -> None:
         """How long the last fsync took, with the records before it. What a power cut costs counts until its end, so on
-        a slow disk the next ones begin earlier; by half of `fsync_s` at most."""
-        self._ahead_ns = int(min(max(ns, 0.9 * self._ahead_ns), self.settings.fsync_s * S / 2))
+        a slow disk the next ones begin earlier, by half of `fsync_s` at most; but the disk gets its pause."""
+        promised = self.settings.fsync_s * S
+        self._ahead_ns = int(min(max(ns, 0.9 * self._ahead_ns), promised / 2))
+        end = self._synced_ns + ns
+        self._rest_ns = end + int(min(ns, promised)) // REST
+        covered, self._covered_ns, self.fsync_ns = self._covered_ns, self._synced_ns, ns
+        late = end - covered if covered else ns  # a power cut just before its end would have cost so much
+        if late > promised + LATE_NS:
+            self.fsyncs_late += 1
+            if not self._late_ns:
+                text = (
+                    f"what came {late / S:.1f} s ago is only now on the disk: a power cut would have cost it, "
+                    f"not the {self.settings.fsync_s:g} s of fsync_s; the last fsync took {ns / S:.1f} s"
+                )
+                self._faults.append(Fault(end, "recorder", "FSYNC_LATE", text, (("lost_s", late / S),)))
+            self._late_ns = end
+        elif self._late_ns and end - self._late_ns > KEPT_UP_NS:
+            self._late_ns = 0
+            text = f"the disk keeps up again: a power cut costs at most {self.settings.fsync_s:g} s"
+            self._faults.append(Fault(end, "recorder", "FSYNC_OK", text, (("late", float(self.fsyncs_late)),)))
 
     def idle(self, now_ns: int, begun_ns: int = 0) -> bool:
         """Do what is due: flush every `flush_s`, fsync every `fsync_s`, retention every minute. Whether an fsync was
@@ -205,6 +240,7 @@ class Recorder:
 
     def _rotate(self, rotate: Rotate) -> None:
         unfinished: RecordingError | None = None
+        was_open = self._writer is not None
         try:
             self.close()
         except RecordingError as e:  # the next segment is tried all the same; the loss is told behind
@@ -220,11 +256,14 @@ class Recorder:
             self._writer = self._open(rotate)
         except OSError as e:
             text = f"no segment can be opened: {e}"
+            if e.errno == errno.EROFS:
+                text += "; where systemd runs it, a data_dir of one's own needs the drop-in data-dir.conf"
             raise RecordingError(_reason(e), text, (*lost, rotate.checkpoint)) from e
         self.segments += 1
         self.recent = (*self.recent[-RECENT + 1 :], self._writer.final)
         # What comes behind a Rotate has waited with it since the last flush: it has no further `flush_s` to wait.
         self._synced_ns = self._flushed_ns
+        self._covered_ns = self._flushed_ns if was_open and not unfinished else 0
         if unfinished:
             raise RecordingError(unfinished.reason, f"{unfinished}; a new segment is open", lost) from unfinished
 
@@ -296,20 +335,17 @@ class Recorder:
         free = self.free_bytes()
         if free < 0:
             return  # the file system does not say
-        missing = self.settings.free_gb * GB - free
+        limit, why = self.settings.free_gb * GB, f"less than {self.settings.free_gb:g} GB free"
+        missing = limit - free
         held = sum(segment.size for segment in segments)
-        if missing > held:
-            self._tell_short(missing, held)
-            return  # something else fills the disk: deleting every recording would not reach the limit either
-        self._short = False
-        while segments and self.free_bytes() < self.settings.free_gb * GB:
-            self._delete(segments.pop(0), f"less than {self.settings.free_gb:g} GB free")
+        self._short = missing > held and (self._short or self._tell_short(missing, held))
+        if self._short:  # something else fills the disk, or it is smaller: deleting every recording would not help
+            limit, why = FLOOR * limit, "the disk is all but full"
+        while segments and self.free_bytes() < limit:
+            self._delete(segments.pop(0), why)
 
-    def _tell_short(self, missing: float, held: int) -> None:
-        """Clips, or what is not ours, fill the disk; told once until there is room again."""
-        if self._short:
-            return
-        self._short = True
+    def _tell_short(self, missing: float, held: int) -> bool:
+        """Clips, or what is not ours, fill the disk; told once until there is room again. True."""
         kept = 0
         with suppress(OSError):
             kept = sum(p.stat().st_size for p in (self.data_dir / "clips").iterdir())
@@ -319,6 +355,7 @@ class Recorder:
             "clips away, or what else fills the disk"
         )
         self._faults.append(Fault(self._now_ns, "recorder", "SPACE_SHORT", text, (("missing_bytes", missing),)))
+        return True
 
     def _delete(self, segment: Segment, why: str) -> bool:
         try:

@@ -944,6 +944,7 @@ def test_any_cut_and_any_stop_give_the_same(
 def test_a_loaded_state_saves_as_itself() -> None:
     """Every part of the state that a stream can set, after each of its sentences."""
     stream = [p for i in range(12) for p in (rmc(clock(i)), gga(clock(i)), *([gst(clock(i))] if i % 4 == 0 else []))]
+    stream.insert(3 * 2 + 6 * 2 + 2, vtg())  # behind the end of its epoch
     stream += [
         POOL[16],
         hdt(),

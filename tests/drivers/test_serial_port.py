@@ -169,6 +169,22 @@ def test_a_busy_device_is_said(pty: Pty) -> None:
     second.close()
 
 
+def test_a_port_whose_read_hangs_lets_its_device_go(pty: Pty) -> None:
+    """GIVEN a driver that holds the device and hangs in a read WHEN it lets go THEN another one may open it."""
+    hung, fresh = make(pty.device), make(pty.device)
+    hung.open()
+    with hung._lock:  # as in a read that does not come back
+        with pytest.raises(PortError, match="busy"):
+            fresh.open()
+        hung.let_go()
+        fresh.open()
+    os.write(pty.master, b"x")
+    assert collect(fresh, 1) == b"x"
+    fresh.close()
+    hung.close()
+    hung.let_go()  # of what is closed: nothing
+
+
 def test_a_file_is_no_port(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_bytes(b"x")

@@ -29,10 +29,11 @@ import numpy as np
 import drivers
 from drivers import PortError
 from edge_agent import assemble, config
+from edge_agent.memory import steady_memory
 from edge_agent.messages import CanFrames, PortSettings, S, Tick
 from edge_agent.reading import HUNG_S
 from edge_agent.recording.segments import Recorder
-from edge_agent.runtime import Agent, resident_bytes, steady_memory
+from edge_agent.runtime import Agent, resident_bytes
 from edge_agent.simulate.encode import nmea_epoch
 from edge_agent.simulate.play import Slcan, Terminal
 

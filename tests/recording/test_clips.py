@@ -283,14 +283,17 @@ def test_more_clips_than_may_wait_are_refused_and_told(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------- what a kill has left undone
 
 
-def killed(folder: Path, *some: tuple[int, Record], run: str = "r", begin: int = 0, end: int = 200) -> list[Path]:
-    """A run of which the process was killed at `end` s: lines and these records as they came, a file a minute."""
+def killed(
+    folder: Path, *some: tuple[int, Record], run: str = "r", begin: int = 0, end: int = 200, drift_ns: int = 0
+) -> list[Path]:
+    """A run of which the process was killed at `end` s: lines and these records as they came, a file a minute, each
+    with a clock `drift_ns` further off."""
     recorder = Recorder(
         folder, RecordSettings(free_gb=0.0, keep_days=1e5), "site", {"run": run}, {"c": b"x"}, lambda: 1 << 40
     )
     for s in range(begin, end):
         if (s - begin) % 60 == 0:
-            recorder.handle(point(s * S), s * S)
+            recorder.handle(point(s * S, OFFSET + (s - begin) // 60 * drift_ns), s * S)
         recorder.handle(line(s * S, f"{s}"), s * S)
         for at, record in some:
             if at == s:
@@ -368,6 +371,48 @@ def test_a_clip_that_was_written_before_the_kill_is_not_made_again(tmp_path: Pat
     c = next_start(tmp_path / "there", run="r4")
     assert [p.name[-8:] for p in files(c)] == ["000.mcap", "001.mcap"]
     assert texts(files(c)[1]) == list(range(40, 72))
+
+
+def test_a_clip_is_known_whatever_the_clock_of_the_file_that_it_was_computed_with(tmp_path: Path) -> None:
+    """Each file has its own map to UTC: the clip's name comes from the first, the event is over in another."""
+    killed(tmp_path, (50, event(BEGIN, "sag", 50 * S)), (55, event(END, "sag", 55 * S, 52 * S)), drift_ns=3 * S // 2)
+    (clip,) = files(next_start(tmp_path))
+    assert files(next_start(tmp_path, run="r3")) == [clip]
+    began = topics.event("CLIP", "clips", "x.mcap: 1 s", (("begin_monotonic_s", 40.0),), 90 * S, 90 * S + OFFSET)
+    itself = Record("/faults", 90 * S + OFFSET, 90 * S + OFFSET, began, False)
+    begin, end = (50, event(BEGIN, "sag", 50 * S)), (55, event(END, "sag", 55 * S, 52 * S))
+    killed(tmp_path / "told", begin, end, (90, itself), drift_ns=3 * S // 2)
+    assert files(next_start(tmp_path / "told")) == []
+
+
+def test_a_clip_of_another_run_with_the_same_second_in_its_name_is_not_mistaken_for_it(tmp_path: Path) -> None:
+    """A clock that was set back names two clips alike."""
+    begin, end = (50, event(BEGIN, "sag", 50 * S)), (55, event(END, "sag", 55 * S, 52 * S))
+    killed(tmp_path / "a", begin, end, run="before")
+    (other,) = files(next_start(tmp_path / "a"))
+    killed(tmp_path / "b", begin, end)
+    (tmp_path / "b" / "clips").mkdir()
+    (tmp_path / "b" / "clips" / other.name).write_bytes(other.read_bytes())
+    first, second = files(next_start(tmp_path / "b"))
+    assert [reader.read_metadata(p)[RUN_METADATA]["run"] for p in (first, second)] == ["before", "r"]
+
+
+def test_no_clip_is_looked_at_where_no_run_was_torn_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thousands of clips and files on a slow card: the index of the last file says that its run ended in order."""
+    recorded(tmp_path, 100)
+    OPEN.pop().close()
+    (tmp_path / "clips").mkdir()
+    looked: list[Path] = []
+
+    def walked(path: Path, *rest: object) -> Any:
+        looked.append(path)
+        raise ValueError("walked through")
+
+    for name in ("newest_ns", "read_messages", "read_between"):
+        monkeypatch.setattr(clips, name, walked)
+    monkeypatch.setattr(clips, "_made", lambda folder, run: walked(folder))
+    assert list(clips.left_over(tmp_path, "site", EventSettings(), {}, "r2")) == []
+    assert looked == []
 
 
 def test_a_run_that_was_stopped_and_one_long_ago_leave_nothing(tmp_path: Path) -> None:

@@ -48,6 +48,30 @@ def test_messages_come_in_the_order_of_the_file(path: Path) -> None:
     assert only == ["/raw/can0", "/raw/gnss"] * 4
 
 
+def test_what_the_index_of_a_file_says_is_what_a_walk_says(path: Path, tmp_path: Path) -> None:
+    """Whole, torn, and with an index that lies or is cut."""
+    newest = max(r.log_ns for r in WANTED)
+    data = path.read_bytes()
+    with reader.view(path) as buffer:
+        chunks = [p for p in reader.parts(buffer) if p.opcode == reader.CHUNK]
+        (footer,) = (p for p in reader.parts(buffer) if p.opcode == reader.FOOTER)
+        (statistics,) = (p for p in reader.parts(buffer) if p.opcode == reader.STATISTICS)
+    lying = bytearray(data)
+    lying[statistics.pos + 34] ^= 0xFF  # the newest time; the index has a CRC
+    for spoilt in (data, bytes(lying), data[: footer.pos], data[: chunks[-1].pos + chunks[-1].length], data + b"x"):
+        one = tmp_path / "one.mcap"
+        one.write_bytes(spoilt)
+        assert reader.newest_ns(one) == newest
+        assert reader.has_metadata(one, "edge_agent:run")
+        assert not reader.has_metadata(one, "edge_agent:repaired")
+    changed = bytearray(data)  # with its CRC made right: it is the index that is read
+    changed[statistics.pos + 34 : statistics.pos + 42] = struct.pack("<Q", 77)
+    (start,) = struct.unpack_from("<Q", data, footer.pos)
+    struct.pack_into("<I", changed, footer.pos + 16, zlib.crc32(changed[start : footer.pos + 16]))
+    one.write_bytes(changed)
+    assert reader.newest_ns(one) == 77
+
+
 def test_a_tally_counts_what_is_not_wanted_too(path: Path, tmp_path: Path) -> None:
     tally = reader.Tally()
     assert [s.topic for s in reader.read_messages(path, {"/raw/gnss"}, tally)] == ["/raw/gnss"] * 4

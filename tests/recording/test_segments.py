@@ -172,6 +172,64 @@ def test_on_a_slow_disk_an_fsync_is_over_when_it_is_due(tmp_path: Path, monkeypa
     recorder.close()
 
 
+def test_a_disk_that_cannot_keep_fsync_s_gets_its_pause_and_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """GIVEN an fsync that takes 4 s of the 5 WHEN it goes on so for three minutes THEN the writer has a quarter of the
+    time for its other work, and what a power cut costs now is told once; and once when the disk keeps up again."""
+    took = 4 * S
+    monkeypatch.setattr(os, "fdatasync", lambda fd: None)
+    recorder = start(tmp_path)
+    now = begin = 100 * S
+    recorder.handle(rotate(), now)
+    recorder.idle(now)
+    recorder.fsync_took(S // 100)
+    busy = 0
+    kinds_at: list[tuple[str, float]] = []
+
+    def go_on(seconds: int) -> None:
+        nonlocal now, busy
+        end = now + seconds * S
+        while now < end:
+            now += max(int(recorder.wait_s(now) * S), S // 100)
+            recorder.handle(line(0), now)
+            begun = now
+            if recorder.idle(now, begun):
+                now += took
+                busy += took
+                recorder.fsync_took(now - begun)
+            kinds_at.extend((f.kind, dict(f.values).get("lost_s", 0.0)) for f in recorder.drain_faults())
+
+    go_on(180)
+    assert 0.5 < busy / (now - begin) < 0.77
+    ((kind, lost),) = kinds_at
+    assert kind == "FSYNC_LATE"
+    assert 6 < lost < 10
+    late = recorder.fsyncs_late
+    assert late > 20
+    assert recorder.fsync_ns == took
+    took = S // 10
+    go_on(50)
+    assert [k for k, _ in kinds_at] == ["FSYNC_LATE"]
+    go_on(30)
+    assert [k for k, _ in kinds_at] == ["FSYNC_LATE", "FSYNC_OK"]
+    assert recorder.fsyncs_late <= late + 1
+    recorder.close()
+
+
+def test_time_without_a_file_is_no_late_fsync(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "fdatasync", lambda fd: None)
+    recorder = start(tmp_path)
+    for at in (100, 200, 300):  # closed in between, as after a refusal
+        recorder.handle(rotate(), at * S)
+        for s in range(at, at + 20):
+            recorder.handle(line(s), s * S)
+            if recorder.idle(s * S, s * S):
+                recorder.fsync_took(S // 10)
+        recorder.close()
+    assert recorder.fsyncs_late == 0
+
+
 def test_what_waited_behind_a_rotate_is_flushed_when_it_would_have_been_without(tmp_path: Path) -> None:
     """GIVEN records that waited nearly a second for the writer WHEN a file is begun THEN they wait no more."""
     recorder = start(tmp_path)
@@ -345,6 +403,38 @@ def test_a_disk_that_others_fill_costs_no_recordings_in_vain(tmp_path: Path) -> 
     assert recorder.drain_faults() == []
     assert (tmp_path / "clips" / "one.mcap").exists()
     recorder.close()
+
+
+@pytest.mark.parametrize(("size", "clips_"), [(100_000, 0), (20_000, 0), (100_000, 60_000)])
+def test_a_disk_never_runs_full_of_recordings_whatever_clock_and_limits(
+    tmp_path: Path, size: int, clips_: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """GIVEN a clock that is never disciplined, and restarts, so that nothing goes for its age; keep_gb far beyond the
+    disk; and a disk smaller than free_gb or half full of clips WHEN recording goes on for long THEN old files go before
+    it is full, no record is refused, and the open file stays."""
+    monkeypatch.setattr(segments, "HEAD_BYTES", 500)
+    least, made = size, 0
+
+    def free() -> int:
+        nonlocal least
+        left = size - clips_ - sum(p.stat().st_size for p in tmp_path.iterdir())
+        least = min(least, left)
+        return left
+
+    for restart in range(6):
+        recorder = start(tmp_path, free, free_gb=5e-5, keep_gb=16.0, keep_days=1e-3)
+        for i in range(5):
+            at = (1000 * restart + 100 * i) * S
+            recorder.handle(replace(rotate(T + at), sync=False), at)
+            for j in range(3):
+                recorder.handle(line(j), at + j * S)
+            recorder.idle(at + 70 * S)
+            made += 1
+            assert recorder.path is not None
+        recorder.close()
+    there = list(tmp_path.glob("*.mcap"))
+    assert 1 < len(there) < made
+    assert least > 0
 
 
 def test_free_space_is_kept_while_a_file_is_open(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ themselves, and that no block is missing in silence.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -66,7 +67,7 @@ class Recorded:
 
     times: dict[str, npt.NDArray[np.int64]]  # port -> ns of its frames, or of its reads
     said: list[tuple[int, str, str]]  # ns, kind, source
-    missing: int  # raw blocks that are in no file, from the holes in their order
+    holes: list[tuple[int, int]]  # raw blocks that are in no file: when the next one came that is, how many
     losses: int  # of raw data, as /faults tells
 
 
@@ -455,14 +456,14 @@ def recorded(files: list[Path]) -> Recorded:
     """What files say whose runs are of one boot."""
     times: dict[str, list[npt.NDArray[np.int64]]] = {port: [np.zeros(0, np.int64)] for port in PORTS}
     said: list[tuple[int, str, str]] = []
-    orders: dict[str, set[int]] = {}
+    orders: dict[str, dict[int, int]] = {}
     losses = 0
     for path in files:
-        mine = orders.setdefault(run_of(path)["run"], set())
+        mine = orders.setdefault(run_of(path)["run"], {})
         for m in stored([path], "/raw/clock", *(f"/raw/{port}" for port in PORTS), "/faults", "/events"):
             if m.topic.startswith("/raw/"):
                 r = topics.decode_raw(m.topic, m.schema, m.data)
-                mine.add(r.order)
+                mine[r.order] = r.t_ns
                 if r.source in times:
                     f = r.payload
                     if isinstance(f, CanFrames):
@@ -474,8 +475,8 @@ def recorded(files: list[Path]) -> Recorded:
             said.append((int(event["monotonic_ns"]), str(event["kind"]), str(event["source"])))
             if event["kind"] == "LOSS" and str(event["source"]).startswith("/raw/"):
                 losses += int(event["values"][0]["value"])
-    missing = sum(max(o) - min(o) + 1 - len(o) for o in orders.values() if o)
-    return Recorded({p: np.sort(np.concatenate(t)) for p, t in times.items()}, sorted(said), missing, losses)
+    holes = [(o[b], b - a - 1) for o in orders.values() for a, b in itertools.pairwise(sorted(o)) if b - a > 1]
+    return Recorded({p: np.sort(np.concatenate(t)) for p, t in times.items()}, sorted(said), holes, losses)
 
 
 def run_of(path: Path) -> dict[str, str]:
@@ -512,8 +513,10 @@ def table(c: Course, cut: Fault, cut_utc_ns: int, boot_ns: int) -> None:
     text = f"{seconds:.2f} s of data before it, {(first - cut.begin_ns) / S:.1f} s until it records again"
     print(ROW.format(cut.name, since(told[0] if told else 0, cut.begin_ns), since(first, cut.begin_ns), text))
     c.s.tally.row(good, "every fault was told and is over", "see the table")
-    text = f"{before.missing + after.missing} blocks missing, {before.losses + after.losses} told by LOSS"
-    c.s.tally.row(before.missing + after.missing <= before.losses + after.losses, "nothing is missing in silence", text)
+    missing = sum(n for _, n in before.holes + after.holes)
+    told_lost = before.losses + after.losses
+    text = f"{missing} blocks missing, {told_lost} told by LOSS"
+    c.s.tally.row(missing <= told_lost, "nothing is missing in silence", text)
     open_ledgers = sum(kind == "LEDGER" for _, kind, _ in before.said + after.said)
     c.s.tally.row(not open_ledgers, "the ledger balanced all the time", f"{open_ledgers} times LEDGER on /faults")
 
@@ -535,7 +538,8 @@ def print_row(fault: Fault, r: Recorded, until_ns: int) -> bool:
     gaps = {port: gap(r.times[port], fault.begin_ns, until_ns) for port in fault.ports}
     if fault.back:
         over = fault.over_ns
-        text = f"{r.missing} blocks of all ports, told by LOSS" if r.missing else "nothing"
+        lost = sum(n for t, n in r.holes if fault.begin_ns <= t < until_ns)
+        text = f"{lost} blocks of all ports, told by LOSS" if lost else "nothing"
     elif "CLOCK_STEP" in fault.kinds:  # nothing should be seen of it
         over = told
         text = "nothing: longest gap " + ", ".join(f"{p} {(b - a) / S:.2f} s" for p, (a, b) in gaps.items())
