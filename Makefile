@@ -51,7 +51,7 @@ test: lint
 	$(BIN)/pytest -n $(JOBS) -q
 
 bench: $(VENV)/.bench
-	$(BIN)/python tests/bench/run.py $(if $(ROWS),--rows $(ROWS)) $(if $(COMPARE),--compare $(COMPARE)) $(if $(DAY),--day) $(BENCH)
+	$(BIN)/python tests/bench/run.py $(if $(ROWS),--rows $(ROWS)) $(if $(COMPARE),--compare $(COMPARE)) $(if $(DAY),--day $(filter-out 1,$(DAY))) $(BENCH)
 
 judges: $(VENV)/.judges
 	$(BIN)/python tests/judges/run.py

@@ -11,6 +11,7 @@ import dataclasses
 import json
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,6 +19,20 @@ from typing import Any
 
 GOOD, WANTING, WRONG_USE, LOSS = 0, 1, 2, 3
 NAMED_FILE = re.compile(r"([A-Za-z0-9_-]{1,32})=(.+)\Z", re.DOTALL)
+
+
+SCENARIOS = (
+    ("clean", "a bridge at .5 and 1.7 Hz, RTK at 10 Hz, accelerometer at 100 Hz, no fault; 15 min"),
+    ("rough", "the same with 5 % outliers, 10 % of the epochs missing, latency, bias, lost and double samples"),
+    ("hostile", "rough, and wrong fixes that agree with each other for 5 to 60 s, 20 an hour"),
+    ("floaty", "hostile, and 15 s of float solutions every 3 min"),
+    ("P0", "bridge and building model on a slider, 1.13, 4.45, 7.27 Hz (Lima et al.); 20 min"),
+    ("P1", "high-rise, .21, .34, .44 Hz, one weak axis (Wang et al.); 1 h"),
+    ("P2", "a receiver alone at 1 Hz that does not move (Duong et al.); 1 h"),
+    ("P3", "arch bridge with traffic, .91, 1.64, 2.52 Hz, float solutions (patent); 15 min"),
+    ("P4", "cable-stayed bridge with traffic, .309, .507, .645 Hz, RTK at 1 Hz (Shan and Qi); 50 min"),
+)
+"""Of `simulate`: what each is, for its --help, which must not import the simulator (a test holds both together)."""
 
 
 class WrongUseError(Exception):
@@ -70,14 +85,25 @@ def _config(args: argparse.Namespace) -> Any:
 
 
 def _run(args: argparse.Namespace) -> int:
-    config = _config(args)
-    from edge_agent.lock import InUseError
-    from edge_agent.runtime import run
-
+    stops = (signal.SIGTERM, signal.SIGINT)
+    before = [signal.signal(number, _stopped) for number in stops]  # until the agent sees to them itself
     try:
-        return run(config)
-    except InUseError as e:
-        raise WrongUseError(f"run: {e}") from None
+        config = _config(args)
+        from edge_agent.lock import InUseError
+        from edge_agent.runtime import run
+
+        try:
+            return run(config)
+        except InUseError as e:
+            raise WrongUseError(f"run: {e}") from None
+    finally:
+        for number, handler in zip(stops, before, strict=True):
+            signal.signal(number, handler)
+
+
+def _stopped(number: int, frame: Any) -> None:
+    """A stop while the service starts: an orderly end. A repair that it cuts short is done at the next start."""
+    raise SystemExit(GOOD)
 
 
 def _check(args: argparse.Namespace) -> int:
@@ -182,6 +208,22 @@ def _port_and_file(text: str, default: str) -> tuple[str, Path]:
     return m[1], Path(m[2])
 
 
+def _place(command: str, path: Path, inputs: Sequence[Path]) -> None:
+    """Refuse an output that could not be written, or would take a recording's place, before the work is done."""
+    folder = path.absolute().parent
+    if path.is_dir():
+        raise WrongUseError(f"{command}: {path} is a folder: name a file in it")
+    if not folder.is_dir():
+        raise WrongUseError(f"{command}: there is no folder {folder}: make it first")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise WrongUseError(f"{command}: may not write into {folder}")
+    inside = (p for i in inputs for p in ([i] if not i.is_dir() else i.iterdir()))
+    if any(p.resolve() == path.resolve() for p in inside if ".mcap" in p.suffixes):
+        raise WrongUseError(f"{command}: {path} is one of the recordings that are read: choose another name")
+    if path.suffix != ".mcap" and path.is_file() and _begins(path):
+        raise WrongUseError(f"{command}: {path} is a recording: a page must not take its place")
+
+
 def _progress() -> Callable[[str], None] | None:
     """Says on one line of a terminal how far long work is; None where stderr is none."""
 
@@ -197,6 +239,17 @@ def _clear() -> None:
         print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
+def _one_site(inputs: Sequence[Path]) -> None:
+    """Settings are those of the first file, so all must be of its site."""
+    from edge_agent.replay import in_order
+    from edge_agent.review.sources import setups
+
+    names = dict.fromkeys(s.config.site for s in setups(in_order(inputs)))
+    if len(names) > 1:
+        told = ", ".join(names)
+        raise WrongUseError(f"replay: files of {len(names)} sites, {told}: name those of one, or give settings with -c")
+
+
 def _compare(args: argparse.Namespace) -> int:
     """`replay --compare`: old settings against new ones."""
     if args.verify:
@@ -205,12 +258,15 @@ def _compare(args: argparse.Namespace) -> int:
         raise WrongUseError("replay: --compare needs other settings: --set path=value, or -c CONFIG")
     if args.page.suffix.lower() not in (".html", ".htm"):
         raise WrongUseError(f"replay: --page {args.page}: the page is HTML, name it so")
+    _place("replay", args.page, args.inputs)
     from edge_agent.config import ConfigError
     from edge_agent.recording.reader import DamagedError
     from edge_agent.replay import ReplayError, in_order, recorded_config
     from edge_agent.review import compare
 
     try:
+        if not args.config:
+            _one_site(args.inputs)
         first = in_order(args.inputs)[0]
         if args.config:
             new = _config(args)
@@ -241,6 +297,8 @@ def _compare(args: argparse.Namespace) -> int:
 def _replay(args: argparse.Namespace) -> int:
     if args.smooth and args.output is None:
         raise WrongUseError("replay: --smooth writes into the new recording: give -o OUT")
+    if args.output is not None:
+        _place("replay", args.output, args.inputs)
     if args.compare:
         return _compare(args)
     if args.output is None and not args.verify:
@@ -251,6 +309,8 @@ def _replay(args: argparse.Namespace) -> int:
     from edge_agent.replay import ReplayError, in_order, recorded_config, replay
 
     try:
+        if config is None:
+            _one_site(args.inputs)
         if args.set and config is None:
             config = recorded_config(in_order(args.inputs)[0], args.set)
         report = replay(args.inputs, args.output, config, args.verify)
@@ -299,21 +359,33 @@ def _verify(args: argparse.Namespace) -> int:
 def _review(args: argparse.Namespace) -> int:
     if args.output is None and not args.json:
         raise WrongUseError("review: give -o REPORT.html for the page, --json for its figures, or both")
+    if args.output is not None:
+        if args.output.suffix.lower() not in (".html", ".htm"):
+            raise WrongUseError(f"review: -o {args.output}: the page is HTML, name it so")
+        _place("review", args.output, args.inputs)
     from edge_agent.replay import ReplayError
     from edge_agent.review import ahead
     from edge_agent.review.report import as_text, review
 
-    ahead.allowed = True
+    ahead.alone()
     try:
-        found, figures = review(args.inputs, args.output, _progress())
+        found = review(args.inputs, args.output, _progress())
     except ReplayError as e:
         raise WrongUseError(f"review: {e}") from None
     finally:
         _clear()
-    _result(args, figures, as_text(found))
-    if args.output is not None:
-        _say(f"report {args.output}")
-    return LOSS if found.damaged else GOOD
+    several = len(found) > 1
+    figures = {"sites": {r.review.config.site: r.figures for r in found}} if several else found[0].figures
+    _result(args, figures, "\n\n".join(as_text(r.review) for r in found))
+    if several:
+        names = ", ".join(r.review.config.site for r in found)
+        _say(f"edge-agent: review: the files are of {len(found)} sites, each has its own page: {names}")
+    for r in found:
+        if r.page is not None:
+            _say(f"report {r.page}")
+    if any(r.review.damaged for r in found):
+        return LOSS
+    return WANTING if several else GOOD
 
 
 def _tune(args: argparse.Namespace) -> int:
@@ -334,10 +406,12 @@ def _tune(args: argparse.Namespace) -> int:
 def _layouts(args: argparse.Namespace) -> int:
     from edge_agent import layouts
     from edge_agent.replay import ReplayError
-    from edge_agent.review.series import configuration, files_of
+    from edge_agent.review.sources import one_site, opened
 
     try:
-        written = layouts.write(configuration(files_of(args.inputs)[0]), args.output)
+        found = opened(args.inputs)
+        one_site(found)
+        written = layouts.write(found.config, args.output)
     except ReplayError as e:
         raise WrongUseError(f"layouts: {e}") from None
     for path in written:
@@ -373,6 +447,14 @@ def _cat(args: argparse.Namespace) -> int:
     return GOOD
 
 
+def _begins(path: Path) -> bool:
+    """Whether a file begins as an MCAP file does."""
+    from edge_agent.recording.reader import MAGIC
+
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
 def _recover(args: argparse.Namespace) -> int:
     from edge_agent.lock import NAME, InUseError, hold
     from edge_agent.recording.repair import recover, repair
@@ -383,6 +465,8 @@ def _recover(args: argparse.Namespace) -> int:
     for path in args.paths:
         if not path.is_dir() and not path.name.endswith((".mcap.part", ".mcap")):
             raise WrongUseError(f"recover: {path} is neither a folder nor a recording (*.mcap.part, *.mcap)")
+        if path.name.endswith(".mcap") and path.is_file() and not _begins(path):
+            raise WrongUseError(f"recover: {path} is no MCAP file: it is left as it is")
         folder = path if path.is_dir() else path.parent
         try:
             held = hold(folder) if (folder / NAME).exists() else None  # a folder that an agent once wrote into
@@ -491,13 +575,13 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
 
     def add(
-        name: str, command: Callable[[argparse.Namespace], int], about: str, example: str
+        name: str, command: Callable[[argparse.Namespace], int], about: str, example: str, more: str = ""
     ) -> argparse.ArgumentParser:
         p = commands.add_parser(
             name,
             help=about,
             description=about[0].upper() + about[1:] + ".",
-            epilog=f"example:\n  {example}",
+            epilog=f"example:\n  {example}" + (f"\n\n{more}" if more else ""),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         p.set_defaults(command=command)
@@ -607,6 +691,8 @@ def _parser() -> argparse.ArgumentParser:
         _review,
         "what moved, how much, how sure, at which frequencies, and what went wrong: one page",
         "edge-agent review /var/lib/edge-agent/recordings -o report.html",
+        "Exit codes: 0 done; 1 done, but the files are of several sites: each has a page of its own,\n"
+        "REPORT-SITE.html; 2 nothing to review, or no place for the page; 3 done, and damaged files are named.",
     )
     p.add_argument("inputs", nargs="+", type=Path, metavar="FOLDER|FILE")
     p.add_argument("-o", "--output", type=Path, metavar="REPORT.html", help="the page; it needs nothing but itself")
@@ -655,11 +741,12 @@ def _parser() -> argparse.ArgumentParser:
         _simulate,
         "a structure with sensors and faults of exactly known truth, as files",
         "edge-agent simulate hostile --seed 7 -o sim/",
+        "scenarios:\n" + "\n".join(f"  {name:8}{text}" for name, text in SCENARIOS),
     )
-    p.add_argument("scenario", metavar="SCENARIO")
+    p.add_argument("scenario", metavar="SCENARIO", help="one of those below")
     p.add_argument("--seed", type=int, default=1, metavar="N", help="the same seed gives the same files")
     p.add_argument("--seconds", type=float, help="as the scenario says if unset")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="made where it is missing")
 
     p = add(
         "demo", _demo, "a simulated bridge plays through real ports into the live agent", "edge-agent demo -o demo-out"

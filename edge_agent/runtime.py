@@ -38,7 +38,7 @@ import drivers
 from edge_agent import assemble, lock
 from edge_agent import messages as m
 from edge_agent import status as st
-from edge_agent.memory import steady_memory
+from edge_agent.memory import grow_names, steady_memory
 from edge_agent.notify import Notifier
 from edge_agent.observe import Observer, Publisher, resident_bytes
 from edge_agent.pipeline import Pipeline
@@ -694,6 +694,7 @@ def run(config: m.Config) -> int:
         print(text, file=sys.stderr, flush=True)
 
     steady_memory()
+    grow_names()
     data_dir = Path(config.data_dir)
     pipeline = assemble.pipeline(config)
     now = time.monotonic_ns()

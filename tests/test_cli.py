@@ -172,7 +172,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 def test_every_command_has_an_example_that_parses(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     run = Run(capsys, name, "--help")
     assert run.code == 0
-    examples = run.out.partition("example:\n")[2].strip().splitlines()
+    examples = run.out.partition("example:\n")[2].partition("\n\n")[0].strip().splitlines()
     assert examples
     for example in examples:
         words = shlex.split(example.partition(">")[0])
@@ -230,3 +230,134 @@ def test_replay_verifies_and_retunes(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "holds no config.yaml: give one with -c" in bare.err
     again = Run(capsys, "replay", sim / "raw.mcap", "-o", fused)
     assert (again.code, again.out) == (2, "")
+
+
+# ----------------------------------------------------------------------------------------- what cannot be, said clearly
+
+MCAP_COMMANDS = (
+    ["review", "IN", "-o", "OUT/r.html"],
+    ["tune", "IN"],
+    ["replay", "IN", "-o", "OUT/o.mcap"],
+    ["verify", "IN"],
+    ["recover", "IN"],
+    ["layouts", "IN", "-o", "OUT/l"],
+)
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A good raw recording, an empty folder, text, another program's MCAP, and one whose configuration is cut out."""
+    from mcap.writer import Writer
+
+    folder = tmp_path_factory.mktemp("places")
+    for name in ("empty", "out", "deep/inside"):
+        (folder / name).mkdir(parents=True)
+    (folder / "text.mcap").write_text("hello")
+    assert cli.main(["simulate", "P2", "--seconds", "5", "-o", str(folder / "sim")]) == 0
+    (folder / "sim" / "raw.mcap").rename(folder / "raw.mcap")
+    (folder / "deep" / "inside" / "raw.mcap").write_bytes((folder / "raw.mcap").read_bytes())
+    with (folder / "strange.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("x", "y")
+        channel = writer.register_channel("/camera", "json", writer.register_schema("a/B", "jsonschema", b"{}"))
+        writer.add_message(channel, 10**18, b"{}", 10**18)
+        writer.finish()
+    return folder
+
+
+@pytest.mark.parametrize("command", MCAP_COMMANDS, ids=lambda c: c[0])
+@pytest.mark.parametrize("what", ["nowhere.mcap", "empty", "text.mcap", "strange.mcap", "deep"])
+def test_what_is_no_recording_is_named_in_one_line(
+    places: Path, command: list[str], what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {p: p.read_bytes() for p in places.rglob("*.mcap*") if p.is_file()}
+    argv = [w.replace("IN", str(places / what)).replace("OUT", str(places / "out")) for w in command]
+    run = Run(capsys, *argv)
+    name = command[0]
+    nothing_to_do = name == "recover" and what in ("empty", "strange.mcap", "deep")
+    expected = 0 if nothing_to_do or (name, what) == ("verify", "strange.mcap") else 2
+    if what == "text.mcap" and name in ("verify", "replay"):
+        expected = 1
+    assert run.code == expected
+    told = run.out + run.err
+    assert "Traceback" not in told
+    assert "Errno" not in told
+    assert "in nothing" not in told
+    if expected == 2:
+        assert run.out == ""
+        (line,) = run.err.splitlines()
+        assert what in line
+        assert line.startswith("edge-agent: ")
+    if what == "deep" and name in ("review", "tune", "layouts"):
+        assert f"there are some in {places / 'deep' / 'inside'}" in run.err
+    if what == "strange.mcap" and name in ("review", "tune", "layouts"):
+        assert "no recording of edge-agent: it holds /camera" in run.err
+    if (name, what) == ("verify", "strange.mcap"):
+        assert "note: strange.mcap holds no raw data" in run.out
+    assert {p: p.read_bytes() for p in places.rglob("*.mcap*") if p.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["review", "raw.mcap", "-o", "gone/r.html"], "there is no folder"),
+        (["review", "raw.mcap", "-o", "out"], "the page is HTML, name it so"),
+        (["review", "raw.mcap", "-o", "out/raw.mcap"], "the page is HTML, name it so"),
+        (["review", "raw.mcap", "-o", "recording.html"], "is a recording"),
+        (["review", "raw.mcap", "-o", "page.html"], "is a folder: name a file in it"),
+        (["replay", "raw.mcap", "-o", "gone/o.mcap"], "there is no folder"),
+        (["replay", "raw.mcap", "-o", "raw.mcap"], "is one of the recordings that are read"),
+        (["replay", ".", "-o", "raw.mcap"], "is one of the recordings that are read"),
+        (["replay", "raw.mcap", "-o", "out"], "is a folder: name a file in it"),
+        (["replay", "raw.mcap", "--set", "fusion.gate_alpha=0.01", "--compare", "--page", "gone/p.html"], "no folder"),
+        (["layouts", "raw.mcap", "-o", "raw.mcap"], "File exists"),
+        (["simulate", "clean", "--seconds", "5", "-o", "raw.mcap"], "File exists"),
+        (["simulate", "clean", "--seconds", "0", "-o", "new"], "the duration must be above 0"),
+    ],
+    ids=lambda v: " ".join(v) if isinstance(v, list) else "",
+)
+def test_an_output_that_cannot_be_is_refused_before_the_work_and_nothing_is_lost(
+    places: Path, argv: list[str], words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(places)
+    (places / "recording.html").write_bytes((places / "raw.mcap").read_bytes())
+    (places / "page.html").mkdir(exist_ok=True)
+    before = {p: p.read_bytes() for p in places.rglob("*") if p.is_file()}
+    run = Run(capsys, *argv)
+    assert (run.code, run.out) == (2, "")
+    (line,) = run.err.splitlines()
+    assert words in line
+    assert "Errno" not in line
+    assert {p: p.read_bytes() for p in places.rglob("*") if p.is_file()} == before
+
+
+def test_a_folder_or_a_file_without_permission_is_said(
+    places: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As another user: here tests may run as root, whom nothing is refused."""
+    monkeypatch.setattr("os.access", lambda *_: False)
+    run = Run(capsys, "review", places / "raw.mcap", "-o", places / "r.html")
+    assert (run.code, run.err) == (2, f"edge-agent: review: may not write into {places}\n")
+
+    def refused(path: Path, *_: object) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("edge_agent.review.series.read_messages", refused)
+    run = Run(capsys, "tune", places / "raw.mcap")
+    assert (run.code, run.err) == (2, f"edge-agent: tune: {places / 'raw.mcap'}: Permission denied\n")
+
+
+def test_simulate_says_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
+    from edge_agent.simulate import SCENARIOS
+
+    said = Run(capsys, "simulate", "--help").out.partition("scenarios:\n")[2].splitlines()
+    assert [line.split()[0] for line in said] == list(SCENARIOS)
+    for line, scenario in zip(said, SCENARIOS.values(), strict=True):
+        assert len(line.split(maxsplit=1)[1]) > 20
+        for mode in scenario.structure.modes[:2] if scenario.name.startswith("P") else ():
+            assert f"{mode.freq_hz:g}".lstrip("0") in line
+
+
+def test_review_says_its_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    said = Run(capsys, "review", "--help").out
+    assert all(f"{k} " in said.partition("Exit codes:")[2] for k in range(4))

@@ -16,15 +16,17 @@ var(offset) = 1 / sum(v^2/S) is reached by no other estimator.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
 import numpy.typing as npt
 
-from edge_agent.messages import F64, I64
+from edge_agent.messages import F64
+from edge_agent.review.integrate import Integral
 from edge_agent.review.likelihood import SKIP, Fit, fit, gains, prepare, whiten
-from edge_agent.review.smooth import NO_ACCELERATIONS, NS, Accelerations, Fixes, Noise, bridged
+from edge_agent.review.smooth import NO_ACCELERATIONS, NS, Accelerations, Fixes
+from edge_agent.review.witness import KNOWN, Windows, Witness, missed
 
 SEARCH_S = 60.0
 LEAST = 15.0
@@ -33,16 +35,20 @@ APART = 10.0
 """Log likelihood by which the best offset must beat every other peak."""
 OBSERVED = 0.1
 """Largest sd of a mounting coefficient that counts as observed: 6 degrees."""
-WINDOW_S = 8.0
+SEEN = 0.3
+"""Smallest coefficient that names an axis."""
+WINDOW_S, WINDOW_FIXES = 8.0, 20.0
 """Yaw is held within so long where it is left free: a car turns a corner in it, a bridge never does."""
 STEADY = 0.8
 """Yaw that is the same in all windows scores 1, and noise in it takes little; one turn of a car scores half."""
-ALARM = 10.0
-"""Log likelihood against the accelerometer in one window that is called a contradiction,"""
-ALARM_EACH = 0.05
-"""and so much more for every value in it: integrated noise costs a little where nothing moves."""
-FEW, OFTEN = 2, 0.25
-"""So many windows, or so large a share of them, may speak against the accelerometer where nothing can be found."""
+FEW = 3
+"""Windows in which the accelerometer tells something, for a word on its scale."""
+SCALE = 0.25
+"""An axis whose scale is off by more than this, and four of its sd, is wrong."""
+STEP = 20.0
+"""Log likelihood that one window may bring for or against a clock or a mounting: they must mend most windows."""
+NOISY = 0.75
+"""Share of the accelerations' power, as a receiver sees it, that may be their noise."""
 RIVALS = 4
 """Hills of the scan that are looked at closely, where the highest does not stand out."""
 MOST = 2400
@@ -55,41 +61,6 @@ FAST_MPS = 0.5
 """rms speed from which a receiver's own speeds say something: no structure reaches it, a vehicle does."""
 CLOCK_S = 0.02
 """An offset below is within what receivers' latencies are known to."""
-
-
-class Integral:
-    """Accelerations integrated once for any trial time: seconds since `zero_ns`, gaps and both outsides at rest."""
-
-    def __init__(self, accel: Accelerations, zero_ns: int) -> None:
-        mean = np.nanmean(accel.xyz, axis=0)
-        t_ns, a, _ = bridged(accel, mean, int(accel.t_ns[0]), int(accel.t_ns[-1]))
-        self.t: F64 = np.asarray((t_ns - zero_ns) * NS, dtype=np.float64)
-        self.a = a
-        h = np.diff(self.t)
-        total = a[:, :-1] + a[:, 1:]
-        self.g1, self.g2 = np.zeros_like(a), np.zeros_like(a)
-        np.cumsum(total * (0.5 * h), axis=1, out=self.g1[:, 1:])
-        np.cumsum(h * (self.g1[:, :-1] + (total + a[:, :-1]) * (h / 6)), axis=1, out=self.g2[:, 1:])
-
-    def between(self, t: F64) -> tuple[F64, F64]:
-        """Single and double integrals over the intervals that end at t[1:] (n, O) s, led by a zero: two (n, 3, O)."""
-        i = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
-        s = t - self.t[i]
-        before, behind = s < 0, t > self.t[-1]
-        h = self.t[i + 1] - self.t[i]
-        inside = np.clip(s, 0.0, h)
-        rest = s - inside  # at rest outside: velocity goes on
-        g1, g2 = np.empty((3, *t.shape)), np.empty((3, *t.shape))
-        for axis in range(3):
-            a0, a1 = self.a[axis][i], self.a[axis][i + 1]
-            slope = (a1 - a0) / h
-            g1[axis] = self.g1[axis][i] + inside * (a0 + 0.5 * slope * inside)
-            g2[axis] = self.g2[axis][i] + inside * (self.g1[axis][i] + inside * (0.5 * a0 + slope * inside / 6))
-            g2[axis] += rest * g1[axis] * (behind | before)
-        s1, s2 = np.zeros((t.shape[0], 3, t.shape[1])), np.zeros((t.shape[0], 3, t.shape[1]))
-        s1[1:] = np.diff(g1, axis=1).transpose(1, 0, 2)
-        s2[1:] = (np.diff(g2, axis=1) - g1[:, :-1] * np.diff(t, axis=0)).transpose(1, 0, 2)
-        return s1, s2
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,9 +104,8 @@ class Mounting:
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """What the two sensors say of each other. t_ns (n,): ends of windows; support (n,): log likelihood with against
-    without the accelerometer as configured, per window; contradictions: spans (begin_ns, end_ns) of windows against it.
-    verdict: "AGREE", "CONTRADICTION", "NOT OBSERVABLE"; text: one sentence for the head of the report. by_speed: the
+    """What the two sensors say of each other. verdict: "AGREE", "CONTRADICTION", "NOT OBSERVABLE"; text: one sentence
+    for the head of the report; windows: what each window says of the accelerometer as it is configured. by_speed: the
     offset by the receiver's speeds in place of its positions, where it moves fast enough and told them."""
 
     verdict: str
@@ -143,10 +113,13 @@ class Agreement:
     offset: Offset
     mounting: Mounting
     scan: Scan
-    t_ns: I64
-    support: F64
-    contradictions: list[tuple[int, int]] = field(default_factory=list)
+    windows: Windows
     by_speed: Offset | None = None
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether what is fused of both sensors is in doubt."""
+        return self.verdict == "CONTRADICTION"
 
 
 def busiest(fixes: Fixes, accel: Accelerations, most: int = MOST) -> Fixes:
@@ -277,16 +250,29 @@ class _Fine:
 
 
 def _refine(
-    fixes: Fixes, accel: Accelerations, both: Fit, offset: float, M: F64, with_rate: bool, rounds: int = 6
+    fixes: Fixes,
+    accel: Accelerations,
+    both: Fit,
+    offset: float,
+    M: F64,
+    with_rate: bool,
+    hiss: Integral | None = None,
+    rounds: int = 6,
 ) -> _Fine:
+    """`hiss`: noise like that of the accelerometer. Its share of what the regression stands on would make every
+    coefficient too small, and is taken off."""
     zero = int(fixes.t_ns[0])
     integral = Integral(accel, zero)
     t = np.asarray((fixes.t_ns - zero) * NS, dtype=np.float64)
     mid, length = 0.5 * t[-1], float(t[-1])
     dt, z, std = prepare(fixes)
     r = np.maximum(both.r, 1e-12)
-    rows = std.shape
-    q, qb = (np.broadcast_to(v / r, rows) for v in (both.noise.q, both.noise.qb))
+    q = both.noise.q / r + missed(fixes, turned(accel, offset, np.eye(3))) / r
+    qb = np.broadcast_to(both.noise.qb / r, std.shape)
+    window = max(WINDOW_S, WINDOW_FIXES * float(np.median(dt[1:])))
+    starts = np.flatnonzero(np.diff(np.floor(t / window).astype(np.int64), prepend=-1))
+    long = np.diff(np.append(starts, len(t)))
+    trust = np.ones((3, len(t)))
     rate, eps = 0.0, 0.25 * float(np.median(dt[1:]))
     y_in = z[:, None, :]
     filters = gains(dt, std, q, qb)
@@ -295,6 +281,11 @@ def _refine(
     # an axis without motion has a variance of nothing; it must not outweigh the others
     weight = np.where(r > 1e-9, 1.0 / np.sqrt(r), 0.0)
     lean = (t - mid) / length
+    noise = np.zeros((len(t), 3, 3))
+    if hiss is not None:
+        s1, s2 = (s.reshape(len(t), 3)[:, :, None] * np.ones(3) for s in hiss.between(t[:, None]))
+        noise = whiten(filters, s1, s2, np.broadcast_to(0.0, s1.shape))
+        noise[:SKIP] = 0.0
     cov = np.full((11, 11), np.inf)
     for _ in range(rounds):
         at = t - offset - rate * (t - mid)
@@ -311,56 +302,39 @@ def _refine(
             X[axis, :, 9] = (own[:, :, 1] - own[:, :, 2]) @ M[axis] / (2 * eps)
             if with_rate:
                 X[axis, :, 10] = (own[:, :, 3] - own[:, :, 4]) @ M[axis] / (2 * eps) * length
-            X[axis] *= weight[axis]
-            Y[axis] = e_y[:, 0, axis] * weight[axis]
+            X[axis] *= weight[axis] * trust[axis][:, None]
+            Y[axis] = e_y[:, 0, axis] * weight[axis] * trust[axis]
         A, y = X.reshape(-1, 11), Y.ravel()
         size = np.sqrt((A * A).sum(axis=0))
         known = size > 1e-9 * size.max()
         theta, cov = np.zeros(11), np.full((11, 11), np.inf)
         B = A[:, known] / size[known]
         normal = B.T @ B + 1e-12 * np.eye(int(known.sum()))
+        own = np.einsum("nji,in->ij", noise * noise, (trust * weight[:, None]) ** 2).ravel()
+        own = np.append(own, (0.0, 0.0))[known] / size[known] ** 2
+        normal -= np.diag(np.minimum(own, NOISY))
         theta[known] = np.linalg.solve(normal, B.T @ y) / size[known]
         cov[np.ix_(known, known)] = np.linalg.inv(normal) / np.outer(size[known], size[known])
+        left = (Y - X @ theta) / trust  # of each axis
+        each = np.add.reduceat(left * left, starts, axis=1) / long
+        # a window of which the model explains less than of the others has more noise than they
+        trust = np.repeat(
+            1.0 / np.sqrt(np.maximum(each / np.maximum(np.median(each, axis=1), 1.0)[:, None], 1.0)), long, 1
+        )
+        score = np.add.reduceat((A * (y - A @ theta)[:, None]).reshape(3, len(t), 11), starts, axis=1).sum(axis=0)
         M = theta[:9].reshape(3, 3)
         step = float(np.clip(theta[9], -eps, eps))
         offset += step
         rate += float(np.clip(theta[10], -2e-3, 2e-3))
         if abs(step) < 1e-5 and abs(theta[10]) < 1e-7:
             break
-    sd = np.sqrt(np.diag(cov))
+    # where neighbours are not independent the scatter of the windows tells the sd, not the curvature
+    ok = np.isfinite(np.diag(cov))
+    bread = np.where(ok[:, None] & ok, cov, 0.0)
+    more = len(starts) / max(len(starts) - int(ok.sum()) / 3, 1.0)
+    spread = np.diag(bread @ (score.T @ score) @ bread) * more
+    sd = np.sqrt(np.where(ok, np.maximum(np.diag(cov), spread), np.inf))
     return _Fine(offset, float(sd[9]), rate, float(sd[10]), M, sd[:9].reshape(3, 3))
-
-
-def support(fixes: Fixes, accel: Accelerations, alone: Fit, both: Fit, window_s: float = 30.0) -> tuple[I64, F64, F64]:
-    """Log likelihood of the fixes with against without the accelerometer in windows: their ends (k,), values (k,), and
-    the loss (k,) that is an alarm.
-
-    Both sides have the noise that suits them best over the record, but no side may be surer than the other that
-    nothing moves: what is left is the motion itself."""
-    zero = int(fixes.t_ns[0])
-    t = np.asarray((fixes.t_ns - zero) * NS, dtype=np.float64)
-    dt, z, std = prepare(fixes)
-    integral = Integral(accel, zero)
-    s1, s2 = (s for s in integral.between(t[:, None]))
-    agile = Noise(np.maximum(alone.noise.q, both.noise.q), np.maximum(alone.noise.qb, both.noise.qb))
-    total = np.zeros(len(t))
-    for side, noise, sign in ((both, both.noise, 1.0), (alone, agile, -1.0)):
-        w1, w2 = (s[:, None, :, 0] * (1.0 if side is both else 0.0) for s in (s1, s2))
-        r = np.maximum(side.r, 1e-12)
-        q, qb = (np.broadcast_to(v / r, std.shape) for v in (noise.q, noise.qb))
-        filters = gains(dt, std, q, qb)
-        e = whiten(filters, w1, w2, z[:, None, :])[:, 0]
-        each = np.where(np.isfinite(std), np.log(filters.variance * r) + e * e / r, 0.0)
-        total += sign * -0.5 * each.sum(axis=1)
-    total[:SKIP] = 0.0
-    covered = (fixes.t_ns >= accel.t_ns[0]) & (fixes.t_ns <= accel.t_ns[-1])
-    total[~covered] = 0.0
-    window = np.floor(t / window_s).astype(np.int64)
-    starts = np.flatnonzero(np.diff(window, prepend=-1))
-    ends = np.append(starts[1:], len(t)) - 1
-    moving = np.isfinite(std) & (np.nanstd(fixes.z_m, axis=0) > 0)
-    alarm = ALARM + ALARM_EACH * np.add.reduceat(moving.sum(axis=1), starts)
-    return fixes.t_ns[ends], np.asarray(np.add.reduceat(total, starts)), np.asarray(alarm)
 
 
 def turned(accel: Accelerations, offset_s: float, matrix: F64) -> Accelerations:
@@ -388,24 +362,22 @@ def agree(fixes: Fixes, accel: Accelerations, *, search_s: float = SEARCH_S) -> 
     # each window brings coefficients of its own, which explain a unit each by chance
     turning = free[f] - found.windows > LEAST and free[f] - free_rival > APART and steady < STEADY and clear >= 5
     configured = fit(part, accel, most=NOISE)
-    t_ns, gain, alarm = support(part, accel, alone, configured)
-    begins = np.concatenate([part.t_ns[:1], t_ns[:-1]])
-    bad = gain < -alarm
-    against = list(zip(begins[bad].tolist(), t_ns[bad].tolist(), strict=True))
-    if turning:
+    witness = Witness(part, accel, alone, configured)
+    now = witness.windows()
+    if turning and not now.confirm:
         close = scan(_Lanes(part, accel, alone), free_peak + 0.125 * step * np.arange(-16.0, 17.0))
-        return _turning(found, close, flipped, t_ns, gain, against)
+        return _turning(found, close, flipped, now)
+    why = "the motion is too small for the receiver, or the accelerations are too noisy"
     if found.fixed[k] < LEAST:
-        why = "no offset stands out: the motion is too small for the receiver, or the accelerations are too noisy"
-        much = len(against) > max(FEW, OFTEN * len(t_ns))
-        verdict = "CONTRADICTION" if much else "NOT OBSERVABLE"
-        text = f"{why}; and they speak against the accelerometer" if much else why
-        return Agreement(verdict, text, _no_offset(why), _no_mounting(why), found, t_ns, gain, against)
+        return _judged(_no_offset(why), _no_mounting(why), found, now, witness, [])
     tried = []
     busy = busiest(part, accel, NOISE)
-    for peak in _hills(found.offset_s, found.fixed)[: RIVALS if found.fixed[k] - fixed_rival < 50 * APART else 1]:
+    hills = _hills(found.offset_s, found.fixed)[: RIVALS if found.fixed[k] - fixed_rival < 50 * APART else 1]
+    if now.confirm:  # they agree as they are: what is asked is how well
+        hills = [_climbed(found.offset_s, found.fixed)]
+    for peak in hills:
         M = _coarse(busy, accel, alone, peak)
-        fine = _refine(busy, accel, alone, peak, M, False, 3)
+        fine = _refine(busy, accel, alone, peak, M, False, rounds=3)
         both = fit(busy, turned(accel, fine.offset, fine.M), most=NOISE)
         tried.append((float(both.log_likelihood.sum()), fine, both))
     tried.sort(key=lambda row: -row[0])
@@ -413,25 +385,84 @@ def agree(fixes: Fixes, accel: Accelerations, *, search_s: float = SEARCH_S) -> 
     lead = tried[0][0] - tried[1][0] if len(tried) > 1 else float(found.fixed[k] - fixed_rival)
     fine = _refine(part, accel, both, fine.offset, fine.M, False)
     both = fit(part, turned(accel, fine.offset, fine.M), most=NOISE)
-    fine = _refine(part, accel, both, fine.offset, fine.M, False)
-    rated = _refine(part, accel, both, fine.offset, fine.M, True)
-    sure = lead > APART and fine.std_offset < 0.25
+    fine = _refine(part, accel, both, fine.offset, fine.M, False, witness.hiss)
+    rated = _refine(part, accel, both, fine.offset, fine.M, True, witness.hiss)
+    sure = (lead > APART or now.confirm) and fine.std_offset < 0.25
     offset = _offset(fine, rated, sure, lead)
     mounting = _mounting(fine)
-    better = float(both.log_likelihood.sum() - configured.log_likelihood.sum())
+    wrong, borne_out = _wrong(offset, mounting, now, witness)
+    turned_by = mounting.observable and abs(mounting.yaw_deg) > 3 * mounting.std_yaw_deg
+    if not borne_out and (turned_by or not now.confirm):
+        mounting = _no_mounting("most of the record is none the better for what is likeliest")
+    if offset.observable and not borne_out and abs(offset.value_s) > max(3 * offset.std_s, CLOCK_S):
+        offset = _no_offset(
+            f"{offset.value_s:+.3f} s is the likeliest, but most of the record is none the better for it"
+        )
+    return _judged(offset, mounting, found, now, witness, wrong)
+
+
+def _wrong(offset: Offset, mounting: Mounting, now: Windows, witness: Witness) -> tuple[list[str], bool]:
+    """What a clock or a mounting that was found explains, and whether most windows are the better for it; if not,
+    nothing is told."""
     wrong = []
-    if sure and better > LEAST and abs(fine.offset) > max(3 * fine.std_offset, CLOCK_S):
-        wrong.append(f"the accelerometer's clock is {abs(fine.offset):.3f} s {'early' if fine.offset > 0 else 'late'}")
-    if better > LEAST and any(a not in ("?", b) for a, b in zip(mounting.axes, ("+x", "+y", "+z"), strict=True)):
+    value, M = 0.0, np.eye(3)
+    if offset.observable and abs(offset.value_s) > max(3 * offset.std_s, CLOCK_S):
+        value = offset.value_s
+        wrong.append(f"the accelerometer's clock is {abs(value):.3f} s {'early' if value > 0 else 'late'}")
+    off = [
+        (name, float(m), float(sd))
+        for name, axis, m, sd in zip("xyz", mounting.axes, np.diag(mounting.matrix), np.diag(mounting.std), strict=True)
+        if axis == "+" + name and abs(m - 1.0) > max(SCALE, 4 * sd)
+    ]
+    if any(a not in ("?", b) for a, b in zip(mounting.axes, ("+x", "+y", "+z"), strict=True)):
         wrong.append(f"its axes stand as {' '.join(mounting.axes)}")
-    elif better > LEAST and mounting.observable and abs(mounting.yaw_deg) > max(5.0, 3 * mounting.std_yaw_deg):
+        M = mounting.matrix
+    elif mounting.observable and abs(mounting.yaw_deg) > max(5.0, 3 * mounting.std_yaw_deg):
         wrong.append(f"it is turned by {mounting.yaw_deg:.1f} deg")
-    if wrong or against:
-        reasons = " and ".join(wrong) or "the fixes speak against the accelerations"
-        text = f"receiver and accelerometer contradict each other: {reasons}"
-        return Agreement("CONTRADICTION", text, offset, mounting, found, t_ns, gain, against)
-    text = "receiver and accelerometer tell of the same motion"
-    return Agreement("AGREE", text, offset, mounting, found, t_ns, gain, against)
+        M = mounting.matrix
+    elif off:
+        told = ", ".join(f"{m:.2f} \u00b1 {sd:.2f} along {name}" for name, m, sd in off)
+        wrong.append(f"its scale is wrong: the fixes show {told} of what it tells")
+        M = mounting.matrix
+    if not wrong:
+        return [], False
+    known = np.isfinite(M) & np.isfinite(mounting.std) & (mounting.std < 0.5)
+    better = witness.windows(value, np.where(known, M, np.eye(3))).support - now.support
+    gain = float(np.clip(better, -STEP, STEP).sum())
+    borne_out = gain > LEAST and bool((better > 0).sum() > (better < 0).sum())
+    return (wrong, True) if borne_out else ([], False)
+
+
+def _percent(share: float, sd: float) -> str:
+    return f"{100 * share:.0f} \u00b1 {max(100 * sd, 1.0):.0f} %".replace("-", "\u2212")
+
+
+def _judged(
+    offset: Offset, mounting: Mounting, found: Scan, now: Windows, witness: Witness, wrong: list[str]
+) -> Agreement:
+    """The verdict, and the words for it."""
+    still = witness.stands_still() if not now.confirm else np.zeros(3)
+    reasons = list(wrong)
+    if not reasons and now.refute:
+        told = _percent(*now.together)
+        reasons.append(f"the fixes do not show the motion that the accelerations tell, but {told} of it")
+    share, sd = now.together
+    if not reasons and sd < KNOWN and now.loud.sum() >= FEW and abs(share - 1.0) - 4 * sd > SCALE:
+        reasons.append(f"the fixes show {_percent(share, sd)} of the motion that the accelerations tell")
+    if not reasons and still.any():
+        axes = ", ".join(name for name, v in zip("xyz", still, strict=True) if v)
+        reasons.append(f"the fixes move along {axes} while the accelerations tell of nothing that could move them")
+    if reasons:
+        text = f"receiver and accelerometer contradict each other: {' and '.join(reasons)}"
+        return Agreement("CONTRADICTION", text, offset, mounting, found, now)
+    if now.confirm:
+        told = _percent(share, sd)
+        text = (
+            f"receiver and accelerometer tell of the same motion: the fixes show {told} of what the accelerations tell"
+        )
+        return Agreement("AGREE", text, offset, mounting, found, now)
+    why = "whether the sensors agree is not observable: no motion stands out of the noise of both that would decide it"
+    return Agreement("NOT OBSERVABLE", why, offset, mounting, found, now)
 
 
 def with_speeds(a: Agreement, fixes: Fixes, velocity_mps: F64, accel: Accelerations) -> Agreement:
@@ -477,6 +508,14 @@ def _peak(offset_s: F64, value: F64) -> tuple[float, float]:
     return best, rival
 
 
+def _climbed(offset_s: F64, value: F64) -> float:
+    """Top of the hill on which no offset lies."""
+    k = int(np.argmin(np.abs(offset_s)))
+    while 0 < k < len(value) - 1 and value[k] < max(value[k - 1], value[k + 1]):
+        k += 1 if value[k + 1] > value[k - 1] else -1
+    return float(offset_s[k])
+
+
 def _hills(offset_s: F64, value: F64) -> list[float]:
     """Offsets of the local maxima, highest first."""
     inner = np.flatnonzero((value[1:-1] >= value[:-2]) & (value[1:-1] > value[2:])) + 1
@@ -486,7 +525,7 @@ def _hills(offset_s: F64, value: F64) -> list[float]:
 
 def _coarse(fixes: Fixes, accel: Accelerations, alone: Fit, offset: float) -> F64:
     """Mounting at a trial offset by the regression of the scan; axes that say nothing keep the configured row."""
-    fine = _refine(fixes, accel, alone, offset, np.eye(3), False, 1)
+    fine = _refine(fixes, accel, alone, offset, np.eye(3), False, rounds=1)
     seen = np.isfinite(fine.std_m).all(axis=1) & (fine.std_m.max(axis=1) < 0.5)
     return np.where(seen[:, None], fine.M, np.eye(3))
 
@@ -517,7 +556,7 @@ def _mounting(fine: _Fine) -> Mounting:
     names = []
     order = max(permutations(range(3)), key=lambda p: sum(_clear(M, sd, i, j) for i, j in enumerate(p)))
     for i, j in enumerate(order):
-        if sd[i, j] >= OBSERVED or abs(M[i, j]) < 0.5:
+        if sd[i, j] >= 2 * OBSERVED or abs(M[i, j]) < max(SEEN, 4 * sd[i, j]):
             names.append("?")
         else:
             names.append(("+" if M[i, j] > 0 else "-") + "xyz"[j])
@@ -538,9 +577,7 @@ def _clear(M: F64, sd: F64, i: int, j: int) -> float:
     return abs(float(M[i, j])) / (1.0 + float(sd[i, j]) / OBSERVED)
 
 
-def _turning(
-    found: Scan, close: Scan, flipped: bool, t_ns: I64, gain: F64, against: list[tuple[int, int]]
-) -> Agreement:
+def _turning(found: Scan, close: Scan, flipped: bool, now: Windows) -> Agreement:
     free = close.mirrored if flipped else close.turning
     value, _ = _peak(close.offset_s, free)
     k = min(max(int(np.argmax(free)), 1), len(free) - 2)
@@ -555,4 +592,4 @@ def _turning(
     text = f"receiver and accelerometer contradict each other: {why}"
     if abs(value) > max(3 * std, CLOCK_S):
         text += f"; the accelerometer's clock is {abs(value):.3f} s {'early' if value > 0 else 'late'}"
-    return Agreement("CONTRADICTION", text, offset, _no_mounting(why), found, t_ns, gain, against)
+    return Agreement("CONTRADICTION", text, offset, _no_mounting(why), found, now)

@@ -16,15 +16,27 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
+from edge_agent.memory import steady_memory
+
 T = TypeVar("T")
 
 WORTH_BYTES = 48 << 20
 """Recordings that are smaller are read sooner than a process has started."""
 
 
+LARGE_BYTES = 512 << 10
+"""Arrays of this size are given back at once, smaller ones are kept for the next: giving back has its price."""
+
 allowed = False
-"""Set by the command line. Another program may not: its second process would run it again from the top, unless it has
+"""Set by `alone`. Another program may not: its second process would run it again from the top, unless it has
 its `if __name__ == "__main__"`."""
+
+
+def alone() -> None:
+    """This process does nothing but review, as one that the command line started."""
+    global allowed
+    allowed = True
+    steady_memory(LARGE_BYTES)
 
 
 def worth(files: Sequence[Path]) -> bool:
@@ -65,6 +77,7 @@ def _received(ours: Connection, process: Any, make: Callable[..., Iterator[T]], 
 
 
 def _serve(pipe: Connection, make: Callable[..., Iterator[T]], args: tuple[Any, ...]) -> None:
+    steady_memory(LARGE_BYTES)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the process that started this one, and that ends this
     try:
         for one in make(*args):

@@ -13,12 +13,14 @@ import numpy.typing as npt
 from edge_agent.messages import F64, I64, S
 from edge_agent.review.integrate import Differences, Overlay, double_integral, second_difference
 from edge_agent.review.likelihood import fit
-from edge_agent.review.smooth import Accelerations, Fixes, smooth
+from edge_agent.review.smooth import Accelerations, Fixes, Noise, smooth, two_filter
 from edge_agent.review.splits import Split
 
 OVERLAY_S = 20.0
 """Seconds that accelerations are integrated alone."""
 NOISE_FIXES = 1000
+SECOND_WAY = 300
+"""Fixes that are smoothed a second way."""
 SETTLE_S, SETTLE_PERIODS = 20.0, 10.0
 """Begin of a stretch in which the D-type's filter is still starting: the longer of both."""
 FIX_GAP_S = 3.0
@@ -34,13 +36,17 @@ class Checks:
     smoothed: tuple[I64, F64] = field(default_factory=lambda: (np.zeros(0, np.int64), np.zeros((0, 3))))
     overlay: Overlay | None = None
     overlay_rows: slice = field(default_factory=lambda: slice(0))
+    second_way: tuple[float, int] = (math.nan, 0)
+    """Largest difference [m] of the smoothed displacement from that of the two-filter smoother, over how many fixes."""
 
 
 def check(fixes: Fixes, accel: Accelerations, live: tuple[I64, F64], low_hz: float, high_hz: float) -> Checks:
     """Second differences between two frequencies, and the overlay where it moves most. ValueError where the record is
     too short to be smoothed."""
     found = Checks()
-    s = smooth(fixes, accel, fit(fixes, accel, most=NOISE_FIXES).noise, std=False)
+    noise = fit(fixes, accel, most=NOISE_FIXES).noise
+    s = smooth(fixes, accel, noise, std=False)
+    found.second_way = _second_way(fixes, accel, noise)
     found.smoothed = s.t_ns, s.displacement_m
     for name, t, d in (("live", *live), ("smoothed", s.t_ns, s.displacement_m), ("raw GNSS", fixes.t_ns, fixes.z_m)):
         if len(t) < 200:
@@ -59,6 +65,15 @@ def check(fixes: Fixes, accel: Accelerations, live: tuple[I64, F64], low_hz: flo
         found.overlay = double_integral(accel, s.t_ns[rows], s.displacement_m[at], s.velocity_mps[at], bias)
         found.overlay_rows = rows
     return found
+
+
+def _second_way(fixes: Fixes, accel: Accelerations, noise: Noise) -> tuple[float, int]:
+    """The smoother against one that shares no recursion with it."""
+    part = fixes.part(0, SECOND_WAY)
+    inside = (accel.t_ns >= part.t_ns[0] - S) & (accel.t_ns <= part.t_ns[-1] + S)
+    near = Accelerations(accel.t_ns[inside], accel.xyz[inside])
+    x, _ = two_filter(part, near, noise)
+    return float(np.abs(smooth(part, near, noise, std=False).x[:, 0] - x[:, 0]).max()), len(part)
 
 
 @dataclass(frozen=True)

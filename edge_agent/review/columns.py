@@ -6,7 +6,7 @@ words are equal have one layout. 1 us a message instead of 40.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -81,8 +81,8 @@ def layout(schema: str, data: bytes) -> tuple[dict[str, Place], list[int]]:
     return places, lengths
 
 
-def groups(schema: str, messages: Sequence[bytes]) -> list[Group]:
-    """Columns of messages of one topic. ValueError for damaged bytes."""
+def groups(schema: str, messages: Sequence[bytes], fields: Container[str] | None = None) -> list[Group]:
+    """Columns of messages of one schema; `fields`: those that are wanted. ValueError for damaged bytes."""
     by_size: dict[int, list[int]] = {}
     for i, data in enumerate(messages):
         by_size.setdefault(len(data), []).append(i)
@@ -98,6 +98,7 @@ def groups(schema: str, messages: Sequence[bytes]) -> list[Group]:
             columns = {
                 name: np.ascontiguousarray(part[:, p.pos : p.pos + p.number * np.dtype(p.dtype).itemsize]).view(p.dtype)
                 for name, p in places.items()
+                if fields is None or name in fields
             }
             out.append(Group(left[alike], columns))
             left, table = left[~alike], table[~alike]

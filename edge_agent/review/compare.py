@@ -25,7 +25,8 @@ import numpy.typing as npt
 from edge_agent import replay as replaying
 from edge_agent.messages import F64, I64, VALID_MODES, Config, Estimate, S, Verdict
 from edge_agent.review.charts import BLUE, GREY, ORANGE, RED, Plot, Scale, length, limits, table, time_scale, utc
-from edge_agent.review.series import Envelope, Fixed, Fused, Judged, Piece, pieces
+from edge_agent.review.estimates import at_the_gate
+from edge_agent.review.series import Envelope, Fixed, Fused, Judged, Piece, Stream, pieces
 from edge_agent.review.smoothed import Smoothed
 
 COUNTED = ("JUMP_OPEN", "JUMP_LEVEL", "DATUM", "REACQUIRE", "OUTAGE_END", "CONTRADICTION", "ACCEL_LOST", "ACCEL_GAP")
@@ -53,7 +54,7 @@ class Side:
     """What one of the settings did at one point; per axis (3,) where it is an array."""
 
     samples: int = 0
-    valid: int = 0
+    valid: Stream = field(default_factory=Stream)
     verdicts: dict[int, int] = field(default_factory=dict)
     events: dict[str, int] = field(default_factory=dict)
     taken: int = 0
@@ -66,7 +67,7 @@ class Side:
 
     def gate(self, verdict: Verdict) -> float:
         """Share of the fixes at the gate that got this verdict."""
-        n = sum(self.verdicts.get(int(v), 0) for v in (Verdict.ACCEPTED, Verdict.REJECTED, Verdict.OFFSET))
+        n = at_the_gate(self.verdicts)
         return self.verdicts.get(int(verdict), 0) / n if n else math.nan
 
 
@@ -219,7 +220,7 @@ class _Point:
             if f is not None and len(f.utc_ns):
                 track = _track(f)
                 side.samples += len(f.utc_ns)
-                side.valid += int(track.valid.sum())
+                side.valid.add(f.utc_ns[track.valid])
                 shown = track.valid[:, None]
                 side.displacement.add(f.utc_ns, np.where(shown, track.d, np.nan))
                 side.std.add(f.utc_ns, np.where(shown, track.sd, np.nan))
@@ -397,7 +398,7 @@ def _number(v: float) -> float | None:
     return float(f"{v:.6g}") if math.isfinite(v) else None
 
 
-def _figures(both: Both, side: Side) -> dict[str, Any]:
+def _figures(both: Both, side: Side, seconds: float) -> dict[str, Any]:
     n, k = max(both.common, 1), max(side.taken, 1)
 
     def each(values: F64, some: int) -> list[float | None] | None:
@@ -405,7 +406,7 @@ def _figures(both: Both, side: Side) -> dict[str, Any]:
 
     return {
         "samples": side.samples,
-        "valid": _number(side.valid / side.samples if side.samples else math.nan),
+        "availability": _number(min(side.valid.covered_ns / S / seconds, 1.0)),
         "mean_std_m": each(side.sd / n, both.common),
         "rms_against_smoothed_m": each(np.sqrt(side.off2 / max(both.smooth, 1)), both.smooth),
         "rms_innovation_m": each(np.sqrt(side.residual2 / k), side.taken),
@@ -421,6 +422,7 @@ def _figures(both: Both, side: Side) -> dict[str, Any]:
 def as_json(c: Comparison) -> dict[str, Any]:
     """Everything, as plain values; lengths in m, three axes each; `expected_nis` is what honest sd would give."""
     points = {}
+    seconds = max((c.end_ns - c.begin_ns) / S, 1e-9)
     for name, b in c.points.items():
         gain, sd = b.gain
         n = max(b.common, 1)
@@ -434,8 +436,8 @@ def as_json(c: Comparison) -> dict[str, Any]:
             "log_likelihood_gain": _number(gain),
             "std_log_likelihood_gain": _number(sd),
             "expected_nis": 3.0,
-            "old": _figures(b, b.old),
-            "new": _figures(b, b.new),
+            "old": _figures(b, b.old, seconds),
+            "new": _figures(b, b.new, seconds),
         }
     return {"settings": list(c.sets), "files": list(c.files), "points": points}
 
@@ -469,9 +471,9 @@ def _rows(b: dict[str, Any]) -> list[tuple[str, list[str]]]:
         ("rms of the innovations [mm]", pair("rms_innovation_m", _mm)),
         ("innovation^2 / variance (1 = honest)", pair("innovation2_over_variance", plain)),
         ("v'S^-1v in the mean (3 = honest)", pair("mean_nis", plain)),
-        ("fixes refused", pair("share_refused", share)),
-        ("fixes on another level", pair("share_on_another_level", share)),
-        ("valid samples", pair("valid", share)),
+        ("fixes refused, of those at the gate", pair("share_refused", share)),
+        ("fixes on another level, of those at the gate", pair("share_on_another_level", share)),
+        ("valid displacement, of the period", pair("availability", share)),
     ]
 
 

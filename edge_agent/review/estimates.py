@@ -9,6 +9,7 @@ drawing (panels_estimates).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,15 +30,23 @@ KEPT = 2000
 """Rows of a track at most; beyond, neighbours are averaged."""
 
 
+def at_the_gate(verdicts: Mapping[int, int]) -> int:
+    """Fixes that the gate had to do with: taken, refused, or used less an open level. Every share of refused fixes in
+    review and compare is of these."""
+    return sum(verdicts.get(int(v), 0) for v in (Verdict.ACCEPTED, Verdict.REJECTED, Verdict.OFFSET))
+
+
 class Track:
     """Means over time: rows of (UTC ns, values (c,), how many samples), averaged in pairs when there are too many."""
 
     def __init__(self) -> None:
         self.rows: list[tuple[int, F64, int]] = []
+        self.folds = 0  # how often pairs were made
 
     def add(self, utc_ns: int, values: F64, count: int = 1) -> None:
         self.rows.append((utc_ns, values, count))
         if len(self.rows) > KEPT:
+            self.folds += 1
             pairs = zip(self.rows[::2], self.rows[1::2], strict=False)
             self.rows = [
                 ((a[0] + b[0]) // 2, (a[1] * a[2] + b[1] * b[2]) / (a[2] + b[2]), a[2] + b[2]) for a, b in pairs

@@ -13,18 +13,29 @@ import numpy as np
 
 from edge_agent.cat import iso
 from edge_agent.messages import F64, AccelFlag, S, Verdict
-from edge_agent.review.agree import CLOCK_S, Agreement
 from edge_agent.review.charts import length, utc
+from edge_agent.review.estimates import at_the_gate
 from edge_agent.review.gather import Extreme, PointFigures, Review, gaps_of, modes_of
 from edge_agent.review.modal import in_phase
-from edge_agent.review.panels import AXES, MM, SENSOR_EVENTS, absent, mm, number, offset_known, percent, quality_name
+from edge_agent.review.panels import (
+    AXES,
+    MM,
+    SENSOR_EVENTS,
+    absent,
+    accelerometer_only,
+    came,
+    mm,
+    number,
+    percent,
+    quality_name,
+)
 from edge_agent.review.panels_estimates import honest_words
+from edge_agent.review.received import UNRECORDED, Due
 from edge_agent.review.sources import differences
 from edge_agent.review.spectra import Spectrum
 
-OFTEN = 0.25
-LEAST = 3
-"""Windows against the accelerometer above this share, and no fewer, are a contradiction."""
+MISSED = 0.001
+"""Epochs or samples that are missing count as lost data above this share."""
 LISTED = 2000
 """Events and gaps in the JSON twin at most."""
 
@@ -91,6 +102,7 @@ def _point(r: Review, name: str, p: PointFigures) -> dict[str, Any]:
         "gate": {
             "fixes": n,
             "verdicts": {Verdict(v).name: k for v, k in sorted(point.verdicts.items())},
+            "share_refused": _value(point.verdicts.get(int(Verdict.REJECTED), 0) / max(at_the_gate(point.verdicts), 1)),
             "over_limit": point.over,
             "innovation2_over_variance": [_value(float(v)) for v in p.nis] if p.gated else None,
             "smallest_step_refused_m": [_value(math.sqrt(16.27) * float(v)) for v in p.std_residual_m]
@@ -116,15 +128,33 @@ def _point(r: Review, name: str, p: PointFigures) -> dict[str, Any]:
         else {
             "verdict": a.verdict,
             "text": a.text,
-            "offset_s": _value(a.offset.value_s) if offset_known(a) else None,
-            "std_offset_s": _value(a.offset.std_s) if offset_known(a) else None,
-            "offset_observable": offset_known(a),
+            "offset_s": _value(a.offset.value_s) if a.offset.observable else None,
+            "std_offset_s": _value(a.offset.std_s) if a.offset.observable else None,
+            "offset_observable": a.offset.observable,
             "offset_by_speed_s": None if a.by_speed is None else _value(a.by_speed.value_s),
             "std_offset_by_speed_s": None if a.by_speed is None else _value(a.by_speed.std_s),
             "yaw_deg": _value(a.mounting.yaw_deg),
             "std_yaw_deg": _value(a.mounting.std_yaw_deg),
             "axes": list(a.mounting.axes),
             "mounting_observable": a.mounting.observable,
+            "share_shown": _value(a.windows.together[0]),
+            "std_share_shown": _value(a.windows.together[1]),
+            "windows": [
+                {
+                    "begin_utc": iso(begin + p.busy.utc_minus_ns),
+                    "end_utc": iso(end + p.busy.utc_minus_ns),
+                    "log_likelihood_with_less_without": _value(support, 5),
+                    "share_shown": _value(share, 4) if loud else None,
+                    "std_share_shown": _value(std, 4) if loud else None,
+                }
+                for begin, end, share, std, support, loud in zip(
+                    *(v.tolist() for v in (a.windows.begin_ns, a.windows.end_ns, a.windows.share, a.windows.std)),
+                    *(v.tolist() for v in (a.windows.support, a.windows.loud)),
+                    strict=True,
+                )
+            ]
+            if p.busy is not None
+            else [],
         },
         "second_difference": {
             what: {
@@ -135,6 +165,7 @@ def _point(r: Review, name: str, p: PointFigures) -> dict[str, Any]:
             }
             for what, d in ({} if p.checks is None else p.checks.differences).items()
         },
+        "smoothed_less_two_filter_m": None if p.checks is None else _value(p.checks.second_way[0], 3),
         "split": _split(p),
         "wavelets": _wavelets(p),
         "heading": _heading(r, name),
@@ -272,6 +303,22 @@ def _clocks(r: Review) -> dict[str, Any]:
     }
 
 
+def _due(due: Due | None) -> dict[str, Any] | None:
+    """What was due and what came. A gap is a place where at least one is missing."""
+    if due is None:
+        return None
+    return {
+        "expected": due.expected,
+        "received": due.received,
+        "missing": due.lost,
+        "missing_for_want_of_a_recording": due.unrecorded,
+        "missing_by_reason": due.missing,
+        "gaps": due.gaps,
+        "longest_gap_s": None if due.longest is None else _value((due.longest.end_ns - due.longest.begin_ns) / S),
+        "interval_s": _value(due.interval_ns / S),
+    }
+
+
 def _gaps(r: Review, stream: Any) -> list[dict[str, Any]]:
     return _listed([(a, b, why.lower().replace("_", " ")) for a, b, why in gaps_of(r, stream)])
 
@@ -301,6 +348,7 @@ def as_json(r: Review) -> dict[str, Any]:
             "mean_latency_s": _value(float(latency.mean[0])) if latency.n else None,
             "std_latency_s": _value(float(latency.std[0])) if latency.n else None,
             "llh_deg_deg_m": [_value(v, 12) for v in place] if place else None,
+            "epochs": _due(r.received.receivers.get(name)),
             "gaps": _gaps(r, x.stream),
         }
     for name, a in r.overview.accelerometers.items():
@@ -308,6 +356,8 @@ def as_json(r: Review) -> dict[str, Any]:
         sensors[name] = {
             "samples": a.stream.samples,
             "rate_hz": _value(S * (a.stream.samples - 1) / a.stream.covered_ns) if a.stream.covered_ns else None,
+            "due": _due(r.received.accelerometers.get(name)),
+            "rms_mps2": _three(r.received.rms(name)),
             "flags": {AccelFlag(v).name: n for v, n in sorted(a.flags.items())},
             "least_mps2": [_value(float(v)) for v in np.nanmin(low, axis=0)] if len(low) else None,
             "largest_mps2": [_value(float(v)) for v in np.nanmax(high, axis=0)] if len(high) else None,
@@ -374,7 +424,7 @@ def conclusions(r: Review) -> list[str]:
     ]
     for name, p in r.points.items():
         if not p.moments.n:
-            text = "no valid displacement in this period" if p.receiver else "no receiver, so vibration only"
+            text = "no valid displacement in this period" if p.receiver else accelerometer_only(r, p)
             out.append(f"{name}: {text}.")
             out += _frequencies(name, p)
             continue
@@ -393,19 +443,18 @@ def conclusions(r: Review) -> list[str]:
                 continue
             e = max((lo, hi), key=lambda v: abs(v.value_m))
             told.append(f"{axis} {mm(e.value_m)} \u00b1 {mm(e.std_m)} mm at {utc(e.utc_ns)[11:]}")
-        out.append(f"{name}: furthest displacement (\u00b1 one sd) " + ", ".join(told) + ".")
+        out.append(f"{name}: furthest displacement from the reference (\u00b1 one sd) " + ", ".join(told) + ".")
         out += _frequencies(name, p)
-        if p.agreement is not None and p.agreement.verdict != "CONTRADICTION":
+        if p.agreement is not None and not p.agreement.in_doubt:
             out.append(f"{name}: {p.agreement.text}.")
-        elif p.agreement is not None and not in_doubt(p.agreement):
-            out.append(f"{name}: receiver and accelerometer tell of the same motion most of the time.")
     for name, x in r.overview.receivers.items():
         if x.stream.samples:
             shares = sorted(x.qualities.items(), key=lambda i: -i[1])
             told = [f"{percent(k / x.stream.samples)} {quality_name(q).lower()}" for q, k in shares]
             latency = r.latency[name]
             words_late = f", latency {1e3 * float(latency.mean[0]):.0f} ms in the mean" if latency.n else ""
-            out.append(f"{name}: {x.stream.samples} fixes, {', '.join(told)}{words_late}.")
+            due = r.received.receivers.get(name, Due())
+            out.append(f"{name}: {came(due, 'epochs')}; {', '.join(told)}{words_late}.")
     return out
 
 
@@ -422,25 +471,12 @@ def _frequencies(name: str, p: PointFigures) -> list[str]:
     return [f"{told}."]
 
 
-def in_doubt(a: Agreement) -> bool:
-    """Whether a contradiction is more than a window or two: a clock, an axis, or a good part of the windows."""
-    if a.verdict != "CONTRADICTION":
-        return False
-    clock = a.offset.observable and abs(a.offset.value_s) > max(3 * a.offset.std_s, CLOCK_S)
-    axes = any(found not in ("?", want) for found, want in zip(a.mounting.axes, ("+x", "+y", "+z"), strict=True))
-    return clock or axes or not len(a.t_ns) or len(a.contradictions) > max(LEAST - 1, OFTEN * len(a.t_ns))
-
-
 def findings(r: Review) -> list[Finding]:
     """What went wrong, the worst first."""
     out = []
     for name, p in r.points.items():
-        a = p.agreement
-        if a is not None and in_doubt(a):
-            out.append(Finding(0, f"{name}: {a.text}"))
-        elif a is not None and a.contradictions:
-            text = f"in {len(a.contradictions)} of {len(a.t_ns)} windows the fixes speak against the accelerations"
-            out.append(Finding(2, f"{name}: {text}; a wrong fix that the gate let in does that too"))
+        if p.agreement is not None and p.agreement.in_doubt:
+            out.append(Finding(0, f"{name}: {p.agreement.text}"))
         out += [
             Finding(0, f"{name}: {kind.lower().replace('_', ' ')} told {_times(n)}")
             for kind, n in _counted(r, name, ("CONTRADICTION",))
@@ -457,20 +493,38 @@ def findings(r: Review) -> list[Finding]:
         out.append(Finding(2, f"the files were made with {len(r.setups)} configurations that differ in {n} settings"))
     for path, why in sorted(r.damaged.items()):
         out.append(Finding(1, f"{path.name} is damaged: {why}"))
+    for path, why in sorted(r.strange.items()):
+        out.append(Finding(2, f"{path.name} is left out: {why}"))
+    for name, far in r.apart.items():
+        told = f"{far / 1e3:.1f} km" if far >= 1e3 else f"{far:.0f} m"
+        text = f"{name} stands {told} from where it stands in other files: two structures under one name of a site"
+        out.append(Finding(0, f"{text}; review their files apart"))
     by_reason: dict[str, list[float]] = {}
     for g in r.verdict.gaps:
         by_reason.setdefault(g.reason, []).append((g.end_ns - g.begin_ns) / S)
     for reason, gaps in sorted(by_reason.items()):
         out.append(Finding(1, f"raw data missing {_times(len(gaps))}, {length(sum(gaps))} in all: {reason}"))
+    for what, found in (("epochs", r.received.receivers), ("samples", r.received.accelerometers)):
+        for name, due in found.items():
+            lost = due.lost - due.unrecorded
+            if lost:
+                why = "; ".join(
+                    f"{n} {k}" for k, n in sorted(due.missing.items(), key=lambda i: -i[1]) if k not in UNRECORDED
+                )
+                level = 1 if lost / (due.expected - due.unrecorded) > MISSED else 2
+                out.append(Finding(level, f"{name}: {came(due, what)}: {why}"))
+    for name in r.config.receivers:
+        if name not in r.received.receivers:
+            out.append(Finding(1, f"{name}: no fix in these files"))
     if r.overview.missing:
         out.append(Finding(1, f"{r.overview.missing} raw blocks are in no file"))
     for name, p in r.points.items():
         for kind, n in _counted(r, name, ("JUMP_OPEN", "DATUM", "REACQUIRE", "OUTAGE_END", "ACCEL_LOST", "ACCEL_GAP")):
             out.append(Finding(2, f"{name}: {_WORDS[kind]}, {_times(n)}"))
         verdicts = r.overview.points[name].verdicts
-        refused, n = verdicts.get(int(Verdict.REJECTED), 0), sum(verdicts.values())
+        refused, n = verdicts.get(int(Verdict.REJECTED), 0), at_the_gate(verdicts)
         if refused:
-            out.append(Finding(2, f"{name}: {refused} of {n} fixes were refused ({percent(refused / n)})"))
+            out.append(Finding(2, f"{name}: {refused} of {n} fixes at the gate were refused ({percent(refused / n)})"))
         dead = sum(b - a for a, b, m in p.spells if m in (5, 6)) / S
         if dead > 1:
             out.append(Finding(1, f"{name}: the estimate was invalid for {length(dead)}"))
@@ -507,8 +561,8 @@ def _times(n: int) -> str:
 
 
 def _counted(r: Review, source: str, kinds: tuple[str, ...]) -> list[tuple[str, int]]:
-    found = [(k, sum(h.kind == k and h.source == source for h in r.overview.happened)) for k in kinds]
-    return [(k, n) for k, n in found if n]
+    seen = r.received.events
+    return [(k, seen[k, source].count) for k in kinds if (k, source) in seen]
 
 
 __all__ = ["MM", "Finding", "as_json", "conclusions", "findings"]

@@ -13,12 +13,14 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from edge_agent import verify
+from edge_agent.geodesy import geodetic_to_ecef
+from edge_agent.memory import give_back
 from edge_agent.messages import F64, I64, U8, VALID_MODES, Config, Estimate, Mode, Quality, S, Verdict
 from edge_agent.recording import topics
 from edge_agent.recording.reader import DamagedError, read_messages
@@ -30,8 +32,10 @@ from edge_agent.review.ahead import ahead, worth
 from edge_agent.review.checks import Apart, Checks, apart, check
 from edge_agent.review.estimates import Estimates
 from edge_agent.review.modal import Modal, Together, identify
+from edge_agent.review.received import Received, unrecorded
 from edge_agent.review.series import (
     KEPT,
+    STRANGE,
     Accelerometer,
     Envelope,
     Happened,
@@ -39,14 +43,14 @@ from edge_agent.review.series import (
     Piece,
     Point,
     Receiver,
+    Share,
     Stream,
-    configuration,
-    files_of,
     pieces,
+    pieces_of,
 )
 from edge_agent.review.smooth import Accelerations, plain
 from edge_agent.review.smoothed import Smoothed, add_all
-from edge_agent.review.sources import Setup, copies, setups, together
+from edge_agent.review.sources import Opened, Setup, copies, opened, setups, together
 from edge_agent.review.splits import Split, split_fusion
 from edge_agent.review.wavelets import Wavelets, wavelets
 
@@ -64,7 +68,9 @@ BUSY_FIXES = (100, 1200)
 """least fixes that it must hold, and those that are enough."""
 TRUSTED = 0.6
 """Where the gate took so large a share of the fixes, what it refused is left out of the questions to the sensors; one
-that refuses more may be wrong itself, for example where the accelerometer contradicts."""
+that refuses more may be wrong itself, for example where the accelerometer contradicts;"""
+REFUSED, TAKEN = 0.12, 0.3
+"""nor is it wrong where the fixes stood on another level for long, if it refused less and took more than this."""
 SMOOTHED = 1 << 14
 """Samples of the smoothed stream that are taken at a time."""
 CLOSE_NS = 6 * S
@@ -80,6 +86,10 @@ SAME = 0.03
 """Peaks of two sensors are one frequency within this share,"""
 SAME_LINES = 1.5
 """or within so many lines of the spectrum."""
+
+
+FAR_M = 200.0
+"""A receiver that stands so far from where it stood is on another structure."""
 
 
 class Extreme(NamedTuple):
@@ -163,7 +173,7 @@ class Averaged:
         if run != self._run:
             self.flush()
             self._run, self._before = run, None
-        self._rows.append((t_ns, x))
+        self._rows.append((t_ns, x.astype(np.float32) if self.keep else x))  # as fine as the converters of sensors
         if t_ns[-1] - self._rows[0][0][0] > CHUNK * self.segment_s * S:
             self.flush()
 
@@ -172,6 +182,7 @@ class Averaged:
         if not rows:
             return
         t, x = np.concatenate([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
+        x = x.astype(np.float64)
         good = np.isfinite(x).all(axis=1)
         t, x = t[good], x[good]
         rising = _rising(t)
@@ -206,7 +217,7 @@ class Averaged:
                 stretch = spectra.uniform(*both, self.rate_hz)
         if power > self._power:
             self._power, self.busiest = power, stretch
-        self._before = t, x, own
+        self._before = t, x.astype(np.float32), own
 
     def _halve(self) -> None:
         pairs = zip(self._parts[::2], self._parts[1::2], strict=False)
@@ -257,15 +268,22 @@ class Frequency(NamedTuple):
 
 
 class Busy(NamedTuple):
-    """Stretch in which a point moved most: fixes t_ns, z_m, std_m and which of them the gate took, accelerations t_ns,
-    xyz, fused t_ns, d, sd; velocity_mps (n, 2) of the fixes as the receiver told it."""
+    """Stretch in which a point moved most: fixes t_ns, z_m, std_m and which of them the gate let in (not those of a
+    start, which it never saw), whether it let in enough of what it saw to be trusted, accelerations t_ns, xyz, fused
+    t_ns, d, sd; velocity_mps (n, 2) of the fixes as the receiver told it."""
 
     utc_minus_ns: int
     fixes: tuple[I64, F64, F64]
     taken: npt.NDArray[np.bool_]
+    trusted: bool
     accel: tuple[I64, F64]
     fused: tuple[I64, F64, F64]
     velocity_mps: F64
+
+
+def _trusted(taken: float, refused: float) -> bool:
+    """Whether a gate that took and refused such shares of the fixes (the rest stood on another level) may be right."""
+    return taken > TRUSTED or (refused < REFUSED and taken > TAKEN)
 
 
 class _Keeper:
@@ -279,7 +297,7 @@ class _Keeper:
         self._count = 0
         self._offset = 0
         self._rows: dict[str, list[tuple[npt.NDArray[np.int64] | F64, ...]]] = {"fixes": [], "accel": [], "fused": []}
-        self._refused: list[I64] = []
+        self._kept: tuple[list[I64], list[I64], list[I64]] = ([], [], [])  # times of REJECTED, OFFSET, START
 
     def add(self, piece: Piece, point: str, receiver: str, accelerometer: str) -> None:
         fixes, accel, fused = (
@@ -302,7 +320,8 @@ class _Keeper:
             self._rows["fixes"].append((fixes.t_ns[good], fixes.z_m[good], fixes.std_m[good], fixes.velocity_mps[good]))
         judged = piece.judged.get(point)
         if judged is not None:
-            self._refused.append(judged.t_ns[np.isin(judged.verdict, (Verdict.REJECTED, Verdict.OFFSET))])
+            for kept, verdict in zip(self._kept, (Verdict.REJECTED, Verdict.OFFSET, Verdict.START), strict=True):
+                kept.append(judged.t_ns[judged.verdict == verdict])
         if accel is not None and len(accel.t_ns):
             self._offset = int(accel.utc_ns[0] - accel.t_ns[0])
             self._rows["accel"].append((accel.t_ns, accel.xyz))
@@ -311,8 +330,9 @@ class _Keeper:
 
     def close(self) -> None:
         rows = {k: [np.concatenate(c) for c in zip(*v, strict=True)] for k, v in self._rows.items() if v}
-        refused = np.concatenate([np.zeros(0, np.int64), *self._refused])
-        self._rows, self._refused = {"fixes": [], "accel": [], "fused": []}, []
+        refused, moved, unseen = (np.concatenate([np.zeros(0, np.int64), *v]) for v in self._kept)
+        refused = np.concatenate([refused, moved])
+        self._rows, self._kept = {"fixes": [], "accel": [], "fused": []}, ([], [], [])
         if not {"fixes", "accel", "fused"} <= rows.keys() or len(rows["fixes"][0]) < BUSY_FIXES[0]:
             return
         t, xyz = rows["accel"]
@@ -323,15 +343,23 @@ class _Keeper:
         score = float(np.diff(xyz, axis=0).std(axis=0).sum()) * math.sqrt(float(t[-1] - t[0]))
         if score > self._score:
             fixes, fused = rows["fixes"], rows["fused"]
+            good, seen = ~np.isin(fixes[0], refused), ~np.isin(fixes[0], unseen)
+            offset = np.isin(fixes[0], moved)
             self._score = score
             self.best = Busy(
                 self._offset,
                 (fixes[0], fixes[1], fixes[2]),
-                ~np.isin(fixes[0], refused),
+                good & seen,
+                _trusted(float(good[seen].mean()), float((~good & ~offset)[seen].mean())) if seen.any() else False,
                 (t, xyz),
                 (fused[0] - self._offset, fused[1], fused[2]),
                 fixes[3],
             )
+
+
+NO_FIXES: tuple[I64, I64, F64] = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
+UNJUDGED_NS = 10 * S
+"""A fix that has no verdict for so long gets none."""
 
 
 @dataclass
@@ -349,6 +377,10 @@ class PointFigures:
     gated: int = 0
     nis: F64 = field(default_factory=lambda: np.zeros(3))  # mean of residual^2 / variance
     std_residual_m: F64 = field(default_factory=lambda: np.zeros(3))  # mean over the fixes at the gate
+    run: str = ""
+    unjudged: tuple[I64, I64, F64] = field(
+        default_factory=lambda: NO_FIXES
+    )  # of that run, t_ns, UTC ns, z_m without a verdict yet
     smoothed: Envelope = field(default_factory=lambda: Envelope(3, FINEST_NS, SPANS))
     smoothed_std_m: Moments = field(default_factory=Moments)
     std_m: Moments = field(default_factory=Moments)
@@ -390,34 +422,36 @@ class Review:
     places: dict[str, tuple[float, float, float]]  # receiver -> latitude, longitude, height
     rejects: dict[tuple[str, str], int]  # source, reason -> count
     estimates: Estimates
+    received: Received
     modal: Modal | None = None
     copies: dict[Path, Path] = field(default_factory=dict)  # left out: it holds nothing that the other does not
+    strange: dict[Path, str] = field(default_factory=dict)  # of other programs, left out
+    apart: dict[str, float] = field(
+        default_factory=dict
+    )  # receiver -> how far it stands apart in files of other settings
 
     @property
     def seconds(self) -> float:
         return max((self.end_ns - self.begin_ns) / S, 1e-9)
 
 
-def gather(inputs: Sequence[Path], progress: Callable[[str], None] | None = None, smooth: bool = True) -> Review:
-    """Read files and folders. Damaged files are named in the result. OSError for a path that is not there; ReplayError
-    where no file holds data and a configuration."""
+def gather(
+    inputs: Sequence[Path] | Opened, progress: Callable[[str], None] | None = None, smooth: bool = True
+) -> Review:
+    """Read files and folders. Damaged files are named in the result. Raises as `sources.opened`."""
 
     def say(text: str) -> None:
         if progress is not None:
             progress(text)
 
-    for path in inputs:
-        path.stat()
-    files, bad = files_of(inputs)
-    if not files:
-        told = "; ".join(f"{p}: {_short(p, why)}" for p, why in sorted(bad.items())) or "no recording there"
-        raise ReplayError(told)
-    config = configuration(files)
-    verdict = _checked([*files, *bad], lambda p: say(f"checking {p.name}"))
-    twice, looked = copies(verdict.files), verdict.files
-    if twice:
-        files = [p for p in files if p not in twice]
-        verdict = verify.judged([f for f in verdict.files if f.path not in twice], verdict.notes)
+    files, bad, config, found = inputs if isinstance(inputs, Opened) else opened(inputs)
+    strange = {path: why for path, why in bad.items() if why.startswith(STRANGE)}
+    bad = {path: why for path, why in bad.items() if path not in strange}
+    looked = _looked([*files, *bad], lambda p: say(f"checking {p.name}"))
+    twice = copies(looked)
+    files = [p for p in files if p not in twice]
+    verdict = verify.judged([f for f in looked if f.path not in twice], [])
+    verdict.gaps += unrecorded(verdict.files, verdict.gaps)
     damaged = {p: _short(p, why) for p, why in bad.items() if not p.name.endswith(PART)}
     unfinished = [p for p in bad if p.name.endswith(PART)]
     for f in looked:
@@ -430,42 +464,39 @@ def gather(inputs: Sequence[Path], progress: Callable[[str], None] | None = None
             damaged.setdefault(f.path, "cut off: its end is missing; what stands before is in the report")
     held = [f for f in verdict.files if f.messages]
     begin, end = min(f.begin_ns for f in held), max(f.end_ns for f in held)
-    found = setups(files)
+    if twice:
+        found = setups(files)
     config = together(config, found)
     review = Review(
         config, found, verdict, Overview(), damaged, unfinished, begin, end, {}, {}, {}, {}, Estimates(config),
-        copies=twice,
+        Received(config, verdict.gaps), copies=twice, strange=strange,
     )  # fmt: skip
     recorded_s = sum(f.end_ns - f.begin_ns for f in held) / S
-    _walk(review, files, min(max(recorded_s / 5, SEGMENT_S[0]), SEGMENT_S[1]), smooth, say)
+    _both(review, files, min(max(recorded_s / 5, SEGMENT_S[0]), SEGMENT_S[1]), smooth, say)
     review.overview.files.update(bad)
     for path, damage in review.overview.files.items():
         if damage and path not in damaged and path not in unfinished:
             damaged[path] = _short(path, damage)
     review.places = {name: place for name in config.receivers if (place := _place(files, name)) is not None}
-    names = list(review.points)
-    half = len(names) // 2 if worth(files) else 0
-    beside = ahead(_answered, [review.points[name] for name in names[:half]]) if half else iter(())
-    for name, p in zip(names[half:], _answered([review.points[name] for name in names[half:]]), strict=True):
-        say(f"{name}: looked closer")
-        review.points[name] = p
-    review.points |= dict(zip(names[:half], beside, strict=True))
+    review.apart = _apart_places(review)
     return review
 
 
-def _checked(files: list[Path], progress: Callable[[Path], None]) -> verify.Verdict:
-    """`verify`, every second file by a second process."""
+def _looked(files: list[Path], progress: Callable[[Path], None]) -> list[verify.File]:
+    """`verify.look` at each, every second file by a second process."""
     theirs = files[1::2] if worth(files) else []
     beside = ahead(verify.looks, theirs) if theirs else iter(())
-    return verify.verify(files, progress, lambda p: next(beside) if p in theirs else verify.look(p))
+    out = []
+    for k, path in enumerate(files):
+        progress(path)
+        out.append(next(beside) if theirs and k % 2 else verify.look(path))
+    return out
 
 
-def _answered(points: list[PointFigures]) -> Iterator[PointFigures]:
-    """The points with what is asked of their busiest minutes."""
-    for p in points:
-        p.close = _close_looks(p)
-        _questions(p)
-        yield p
+def _answered(p: PointFigures) -> None:
+    """What is asked of a point's busiest minutes."""
+    p.close = _close_looks(p)
+    _questions(p)
 
 
 def _short(path: Path, why: str) -> str:
@@ -479,20 +510,29 @@ def _envelopes() -> tuple[Point, Receiver, Accelerometer]:
         return Envelope(columns, FINEST_NS, SPANS)
 
     return (
-        Point(displacement=fine(3), velocity=Envelope(3, S, 200), std=fine(3), residual=fine(3), ratio=fine(1)),
+        Point(displacement=fine(3), std=fine(3), residual=fine(3), ratio=fine(1)),
         Receiver(position=fine(3), latency=fine(1), satellites=fine(1), age=fine(1)),
         Accelerometer(xyz=fine(3)),
     )
 
 
-def _walk(review: Review, files: Sequence[Path], segment_s: float, smooth: bool, say: Callable[[str], None]) -> None:
+def _walk(
+    review: Review,
+    files: Sequence[Path],
+    segment_s: float,
+    smooth: bool,
+    say: Callable[[str], None],
+    share: Share | None,
+) -> Iterator[Piece]:
+    """Take all pieces into the review; `share`: only these points and accelerometers. Yields each piece when it is
+    done with it."""
     config, overview = review.config, review.overview
     keepers: dict[str, _Keeper] = {}
     fused: dict[str, Averaged] = {}
     gnss: dict[str, Averaged] = {}
     accel: dict[str, Averaged] = {}
     smoothers: dict[str, Smoothed] = {}
-    names = sorted(config.points)
+    names = sorted(config.points if share is None else share.points)
     total = sum(f.stat().st_size for f in files) or 1
     done, shown = 0, ""
     for name in names:
@@ -501,17 +541,20 @@ def _walk(review: Review, files: Sequence[Path], segment_s: float, smooth: bool,
         overview.points[name] = _envelopes()[0]
         keepers[name], fused[name], gnss[name] = _Keeper(), Averaged(segment_s), Averaged(segment_s)
         if smooth and p.receiver:
-            smoothers[name] = Smoothed(config, name, block=SMOOTHED)
+            smoothers[name] = Smoothed(config, name, block=SMOOTHED, velocity=False)
     for name in config.receivers:
         overview.receivers[name] = _envelopes()[1]
         review.latency[name] = Moments()
-    for name in config.accelerometers:
+    for name in sorted(config.accelerometers if share is None else share.accelerometers):
         overview.accelerometers[name] = _envelopes()[2]
         accel[name] = Averaged(segment_s, keep=True)
     current = None
     own = {path: s.config for s in review.setups for path in s.files}
-    moving = Together()
-    for piece in pieces(files, config, accelerations=bool(config.accelerometers), own=own):
+    if share is None:
+        found = pieces(files, config, accelerations=bool(config.accelerometers), own=own)
+    else:
+        found = pieces_of(files, config, own, share)
+    for piece in found:
         if piece.path != current:
             done += current.stat().st_size if current is not None else 0
             current = piece.path
@@ -527,29 +570,114 @@ def _walk(review: Review, files: Sequence[Path], segment_s: float, smooth: bool,
             _smooth(review.points[name], e, offset)
         for name, x in piece.fixes.items():
             review.latency.setdefault(name, Moments()).add(x.latency_s[np.isfinite(x.latency_s)][:, None])
+        if piece.first:
+            give_back()
         for name, a in piece.accelerations.items():
             accel.setdefault(name, Averaged(segment_s, keep=True)).add(piece.run, a.utc_ns, a.xyz)
         overview.add(_for_overview(review, piece))
         review.estimates.add(piece)
-        moving.add(piece)
+        review.received.add(piece)
+        yield piece
         del piece  # before the next one is there
     for name in names:
         p = review.points[name]
         if name in smoothers:
-            for e, offset in smoothers[name].finish():
+            for e, offset in smoothers.pop(name).finish():  # done with: what it holds is not needed below
                 _smooth(p, e, offset)
         keepers[name].close()
-        p.busy = keepers[name].best
-        p.fused_spectrum, p.gnss_spectrum = fused[name].spectrum(), gnss[name].spectrum()
+        p.busy = keepers.pop(name).best
+        p.fused_spectrum, p.gnss_spectrum = fused.pop(name).spectrum(), gnss.pop(name).spectrum()
         if p.accelerometer in accel:
             p.accel_spectrum = accel[p.accelerometer].spectrum()
             p.frequencies = _frequencies(p, accel[p.accelerometer].busiest)
             p.track = accel[p.accelerometer].track([f.freq_hz for f in p.frequencies])
+
+
+def _shares(config: Config) -> tuple[Share, Share]:
+    """Points and accelerometers in two halves; what belongs to no point is in the first."""
+    names = sorted(config.points)
+    first = names[: -(-len(names) // 2)]
+    mine = {config.points[name].accelerometer for name in first}
+    theirs = {config.points[name].accelerometer for name in names[len(first) :]} - mine
+    sensors = frozenset(config.accelerometers)
+    return (
+        Share(frozenset(first), frozenset(sensors - theirs)),
+        Share(frozenset(names[len(first) :]), frozenset(sensors & {n for n in theirs if n})),
+    )
+
+
+def _both(review: Review, files: list[Path], segment_s: float, smooth: bool, say: Callable[[str], None]) -> None:
+    """Walk over the files and look closer at each point; where there is a second process to be had, it does so with
+    half of the points. Each reads all files: that costs less than to hand over what is in them."""
+    config = review.config
+    share: Share | None = None
+    beside: Iterator[Any] = iter(())
+    if len(config.points) > 1 and worth(files):
+        share, theirs = _shares(config)
+        beside = ahead(_half, files, review.setups, config, review.verdict.gaps, segment_s, smooth, theirs)
+    moving = Together()
+    for piece in _walk(review, files, segment_s, smooth, say, share):
+        found = piece.accelerations
+        if share is not None:
+            found = found | next(beside)
+        moving.add(dataclasses.replace(piece, accelerations={n: found[n] for n in config.accelerometers if n in found}))
+        del piece, found  # before the next ones are there
     moving.close()
+    give_back()
+    for name, p in review.points.items():
+        _answered(p)
+        say(f"{name}: looked closer")
+    if share is not None:
+        _join(review, next(beside), theirs)
+    for table, _ in _tables(review):
+        items = sorted(table.items())
+        table.clear()
+        table.update(items)
     channels = moving.channels()
     if channels is not None:
         say("modes of all accelerometers together")
         review.modal = identify(channels, _apart(f.freq_hz for p in review.points.values() for f in p.frequencies))
+
+
+def _half(
+    files: list[Path],
+    found: list[Setup],
+    config: Config,
+    gaps: list[verify.Gap],
+    segment_s: float,
+    smooth: bool,
+    share: Share,
+) -> Iterator[Any]:
+    """A share of the work: the accelerations of each piece, then a Review in which nothing counts but that share."""
+    review = Review(
+        config, found, verify.Verdict([]), Overview(), {}, [], 0, 0, {}, {}, {}, {}, Estimates(config),
+        Received(config, gaps),
+    )  # fmt: skip
+    for piece in _walk(review, files, segment_s, smooth, lambda _: None, share):
+        yield {
+            name: dataclasses.replace(a, t_ns=a.t_ns[:0], xyz=a.xyz.astype(np.float32), flags=a.flags[:0])
+            for name, a in piece.accelerations.items()
+        }
+    give_back()
+    for p in review.points.values():
+        _answered(p)
+    yield review
+
+
+def _tables(r: Review) -> list[tuple[dict[str, Any], bool]]:
+    """What is kept by the name of a point (True) or of an accelerometer."""
+    points = r.points, r.overview.points, r.estimates.gated, r.estimates.bias, r.received.states, r.received.verdicts
+    sensors = (
+        r.overview.accelerometers, r.estimates.rates, r.received.accelerometers, r.received.flags, r.received.shaking,
+    )  # fmt: skip
+    return [*((t, True) for t in points), *((t, False) for t in sensors)]
+
+
+def _join(review: Review, other: Review, share: Share) -> None:
+    """Take a share from another's review."""
+    for (mine, of_points), (theirs, _) in zip(_tables(review), _tables(other), strict=True):
+        names = share.points if of_points else share.accelerometers
+        mine.update({name: value for name, value in theirs.items() if name in names})
 
 
 def _for_overview(review: Review, piece: Piece) -> Piece:
@@ -588,7 +716,13 @@ def _point(p: PointFigures, piece: Piece, name: str, fused: Averaged, gnss: Aver
         fused.add(piece.run, t, d)
         _mode_spells(p, f.utc_ns, f.mode)
     j, x = piece.judged.get(name), piece.fixes.get(p.receiver)
-    if j is None:
+    if piece.run != p.run:
+        p.run, p.unjudged = piece.run, NO_FIXES
+    if x is not None and len(x.t_ns):
+        t, utc, z = p.unjudged
+        waiting = np.concatenate([t, x.t_ns]), np.concatenate([utc, x.utc_ns]), np.concatenate([z, x.z_m])
+        p.unjudged = _later(waiting, int(x.t_ns[0]) - UNJUDGED_NS)
+    if j is None or not len(j.t_ns):
         return
     used = np.isin(j.verdict, (Verdict.ACCEPTED, Verdict.REJECTED, Verdict.OFFSET))
     used &= (j.std_residual_m > 0).all(axis=1) & np.isfinite(j.residual_m).all(axis=1)
@@ -600,11 +734,16 @@ def _point(p: PointFigures, piece: Piece, name: str, fused: Averaged, gnss: Aver
         p.nis = p.nis + (share.mean(axis=0) - p.nis) * (n / total)
         p.std_residual_m = p.std_residual_m + (j.std_residual_m[counted].mean(axis=0) - p.std_residual_m) * (n / total)
         p.gated = total
-    if x is not None:
-        good = np.isin(x.t_ns, j.t_ns[np.isin(j.verdict, (Verdict.ACCEPTED, Verdict.START))]) & np.isfinite(x.z_m).all(
-            axis=1
-        )
-        gnss.add(piece.run, x.utc_ns[good], x.z_m[good])
+    t, utc, z = p.unjudged  # a verdict may stand in the piece behind that of its fix
+    taken = np.isin(t, j.t_ns[j.verdict == Verdict.ACCEPTED]) & np.isfinite(z).all(axis=1)  # none sees those of a start
+    gnss.add(piece.run, utc[taken], z[taken])
+    p.unjudged = _later(p.unjudged, int(j.t_ns.max()))
+
+
+def _later(fixes: tuple[I64, I64, F64], t_ns: int) -> tuple[I64, I64, F64]:
+    """Those behind a time."""
+    good = fixes[0] > t_ns
+    return fixes[0][good], fixes[1][good], fixes[2][good]
 
 
 def _extremes(p: PointFigures, t: I64, d: F64, sd: F64) -> None:
@@ -668,14 +807,15 @@ def _apart(freq_hz: Iterable[float]) -> list[float]:
     return out
 
 
-def _all_peaks(s: spectra.Spectrum, axis: int, above_db: float) -> list[spectra.Peak]:
+def _all_peaks(s: spectra.Spectrum, axis: int, above_db: float, alone: bool = True) -> list[spectra.Peak]:
     """Peaks of an axis. The floor is taken over a width that grows with the frequency, as modes do."""
     step, top = float(s.freq_hz[1]), 0.9 * float(s.freq_hz[-1])
     found: list[spectra.Peak] = []
     for low, high, width in ((3 * step, 2.0, 0.4), (2.0, top, 2.0)):
         if low < min(high, top):
             w = max(width, 12 * step)
-            found += spectra.peaks(s, axis, low_hz=low, high_hz=min(high, top), above_db=above_db, width_hz=w)
+            high = min(high, top)
+            found += spectra.peaks(s, axis, low_hz=low, high_hz=high, above_db=above_db, width_hz=w, alone=alone)
     return found
 
 
@@ -698,7 +838,9 @@ def _frequencies(p: PointFigures, stretch: spectra.Uniform | None) -> list[Frequ
     groups.sort(key=lambda g: -max(peak.above_db for peak, _ in g))
     groups = sorted(groups[:MODES], key=lambda g: g[0][0].freq_hz)
     other = [
-        [peak.freq_hz for axis in range(3) for peak in _all_peaks(o, axis, spectra.BOTTOM_DB)] if o is not None else []
+        [peak.freq_hz for axis in range(3) for peak in _all_peaks(o, axis, spectra.BOTTOM_DB, False)]
+        if o is not None
+        else []
         for o in (p.fused_spectrum, p.gnss_spectrum)
     ]
     tops = [max(g, key=lambda row: row[0].above_db) for g in groups]
@@ -739,12 +881,12 @@ def _frequencies(p: PointFigures, stretch: spectra.Uniform | None) -> list[Frequ
 
 
 def _close_looks(p: PointFigures) -> list[Close]:
-    """Full-rate samples around the furthest displacement of each axis from its mean."""
+    """Full-rate samples around the furthest displacement of each axis from the reference, which is zero."""
     out = []
     for axis in range(3):
-        low, high, mean = p.low[axis], p.high[axis], float(p.moments.mean[axis])
+        low, high = p.low[axis], p.high[axis]
         if low is not None and high is not None:
-            out.append(p.looks[axis, high.value_m - mean > mean - low.value_m])
+            out.append(p.looks[axis, high.value_m > -low.value_m])
     return out
 
 
@@ -762,13 +904,24 @@ def _place(files: Sequence[Path], receiver: str) -> tuple[float, float, float] |
     return None
 
 
+def _apart_places(review: Review) -> dict[str, float]:
+    """How far [m] each receiver stands apart in files of different configurations, where that is further than FAR_M."""
+    out = {}
+    for name in review.config.receivers if len(review.setups) > 1 else ():
+        places = [at for s in review.setups if (at := _place(s.files[:1], name)) is not None]
+        far = max((math.dist(geodetic_to_ecef(*places[0]), geodetic_to_ecef(*at)) for at in places[1:]), default=0.0)
+        if far > FAR_M:
+            out[name] = far
+    return out
+
+
 def _questions(p: PointFigures) -> None:
     """What needs all samples at once, asked of the busiest minutes."""
     if p.busy is None:
         return
     t, z, std = p.busy.fixes
     good = _rising(t)
-    if p.busy.taken.mean() > TRUSTED:
+    if p.busy.trusted:
         good &= p.busy.taken
     t, z, std = t[good], z[good], std[good]
     fixes = plain(t, z, np.where(np.isfinite(std) & (std > 0), std, 0.01))

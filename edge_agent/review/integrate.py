@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge_agent.messages import F64, I64
-from edge_agent.review.agree import Integral
-from edge_agent.review.smooth import NS, Accelerations
+from edge_agent.review.smooth import NS, Accelerations, bridged
 
 FLANK = 0.25
 """Half width of a filter's flank, as a share of its cut."""
@@ -41,6 +40,41 @@ def high_pass(x: F64, rate_hz: float, cut_hz: float) -> F64:
 def band_pass(x: F64, rate_hz: float, low_hz: float, high_hz: float) -> F64:
     """Columns of x (n, c) between two frequencies."""
     return high_pass(low_pass(x, rate_hz, high_hz), rate_hz, low_hz)
+
+
+class Integral:
+    """Accelerations integrated once for any trial time: seconds since `zero_ns`, gaps and both outsides at rest."""
+
+    def __init__(self, accel: Accelerations, zero_ns: int) -> None:
+        mean = np.nanmean(accel.xyz, axis=0)
+        t_ns, a, _ = bridged(accel, mean, int(accel.t_ns[0]), int(accel.t_ns[-1]))
+        self.t: F64 = np.asarray((t_ns - zero_ns) * NS, dtype=np.float64)
+        self.a = a
+        h = np.diff(self.t)
+        total = a[:, :-1] + a[:, 1:]
+        self.g1, self.g2 = np.zeros_like(a), np.zeros_like(a)
+        np.cumsum(total * (0.5 * h), axis=1, out=self.g1[:, 1:])
+        np.cumsum(h * (self.g1[:, :-1] + (total + a[:, :-1]) * (h / 6)), axis=1, out=self.g2[:, 1:])
+
+    def between(self, t: F64) -> tuple[F64, F64]:
+        """Single and double integrals over the intervals that end at t[1:] (n, O) s, led by a zero: two (n, 3, O)."""
+        i = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
+        s = t - self.t[i]
+        before, behind = s < 0, t > self.t[-1]
+        h = self.t[i + 1] - self.t[i]
+        inside = np.clip(s, 0.0, h)
+        rest = s - inside  # at rest outside: velocity goes on
+        g1, g2 = np.empty((3, *t.shape)), np.empty((3, *t.shape))
+        for axis in range(3):
+            a0, a1 = self.a[axis][i], self.a[axis][i + 1]
+            slope = (a1 - a0) / h
+            g1[axis] = self.g1[axis][i] + inside * (a0 + 0.5 * slope * inside)
+            g2[axis] = self.g2[axis][i] + inside * (self.g1[axis][i] + inside * (0.5 * a0 + slope * inside / 6))
+            g2[axis] += rest * g1[axis] * (behind | before)
+        s1, s2 = np.zeros((t.shape[0], 3, t.shape[1])), np.zeros((t.shape[0], 3, t.shape[1]))
+        s1[1:] = np.diff(g1, axis=1).transpose(1, 0, 2)
+        s2[1:] = (np.diff(g2, axis=1) - g1[:, :-1] * np.diff(t, axis=0)).transpose(1, 0, 2)
+        return s1, s2
 
 
 @dataclass(frozen=True, slots=True)

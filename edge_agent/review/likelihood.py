@@ -23,17 +23,17 @@ SKIP = 6
 """First innovations that carry the wide start and are not counted."""
 THIN_S = 0.5
 """Fixes of a long record are thinned to so far apart: noise is slow, and a long record shows more of it."""
+CELLS = 300_000
+"""Lanes times fixes that are tried at a time, at most or one problem: 2.4 MB for each of a dozen arrays."""
 START_VB = 1e8
 """Start variance of v [m2/s2] and b [m2/s4] in units of the first fix's variance: 30 m/s at 3 mm."""
 
 
 class Gains(NamedTuple):
-    """What the filter of each lane does at each fix, whatever goes in: gains g0, g1, g2 (n, G) for d, v, b, zero where
-    no fix is; 1/sqrt(S) (n, G), zero likewise; S in units of r, 1 likewise; dt (n,)."""
+    """What the filter of each lane does at each fix, whatever goes in: gains (n, 3, G) for d, v, b, zero where no fix
+    is; 1/sqrt(S) (n, G), zero likewise; S in units of r, 1 likewise; dt (n,)."""
 
-    g0: F64
-    g1: F64
-    g2: F64
+    gain: F64
     weight: F64
     variance: F64
     dt: F64
@@ -43,67 +43,72 @@ def gains(dt: F64, std: F64, q: F64, qb: F64) -> Gains:
     """dt (n,) or (n, G) s before each fix, 0 for the first; std (n, G) declared sd, inf = no fix; q, qb (n, G) ratios
     over the interval before. The first fix is the start.
 
-    Every lane is computed alike whatever stands beside it; arrays are used again, for most of the time here is numpy's
-    cost for each call."""
+    Every lane is computed alike whatever stands beside it; arrays are used again and parts of the covariance go
+    together, for most of the time here is numpy's cost for each call."""
     n, G = std.shape
     used = np.isfinite(std)
     R = np.where(used, std, 1.0) ** 2
-    g0, g1, g2 = np.zeros((n, G)), np.zeros((n, G)), np.zeros((n, G))
+    gain = np.zeros((n, 3, G))
     variance = np.ones((n, G))
-    first = R[0]
-    dd, dv, db = first.copy(), np.zeros(G), np.zeros(G)
-    vv, vb, bb = START_VB * first, np.zeros(G), START_VB * first
-    x, inverse = np.empty(G), np.empty(G)
+    C = np.zeros((6, G))  # dd, dv, db, vv, vb, bb
+    C[0], C[3], C[5] = R[0], START_VB * R[0], START_VB * R[0]
+    x, inverse, buffer = np.empty(G), np.empty(G), np.empty((6, G))
     steps = _steps_of(dt)
     same = np.zeros(n, np.bool_)  # as much noise as on the step before
     same[1:] = (q[1:] == q[:-1]).all(axis=1) & (qb[1:] == qb[:-1]).all(axis=1)
-    noise: dict[float, tuple[F64, ...]] = {}
+    noise: dict[float, F64] = {}
+    ahead: dict[float, list[F64]] = {}
+    multiply, subtract, least = np.multiply, np.subtract, np.minimum.reduce
+    targets = [(C[:i], C[j], buffer[:i]) for j, i in ((1, 1), (2, 2), (3, 2), (4, 4), (5, 5))]
+    known, doubled, bd, odd, even, last = C[:3], C[3:5], C[1:3], C[3::2], C[2], C[5]
+    tops, pairs = buffer[:3], buffer[:2]
     for k in range(1, n):
         t = steps[k]
-        h, t2 = 0.5 * t * t, t * t
-        # F P F' + Q, written out
-        for part, factor in ((dv, 2 * t), (db, -2 * h), (vv, t2), (vb, -2 * t * h), (bb, h * h)):
-            np.multiply(part, factor, out=x)
-            dd += x
-        for part, factor in ((vv, t), (db, -t), (vb, -(h + t2)), (bb, h * t)):
-            np.multiply(part, factor, out=x)
-            dv += x
-        for part, factor in ((vb, t), (bb, -h)):
-            np.multiply(part, factor, out=x)
-            db += x
-        for part, factor in ((vb, -2 * t), (bb, t2)):
-            np.multiply(part, factor, out=x)
-            vv += x
-        np.multiply(bb, t, out=x)
-        vb -= x
+        one = isinstance(t, float)
+        columns = ahead.get(t) if one else None
+        if columns is None:
+            columns = _ahead_of(t)
+            if one:
+                ahead[t] = columns
+        for column, (target, source, part) in zip(columns, targets, strict=True):  # F P F'
+            multiply(column, source, out=part)
+            target += part
         if not same[k]:
             noise.clear()
-        added = noise.get(t) if isinstance(t, float) else None
+        added = noise.get(t) if one else None
         if added is None:
-            added = _noise_of(t, q[k], qb[k])
-            if isinstance(t, float):
+            added = np.stack(_noise_of(t, q[k], qb[k]))
+            if one:
                 noise[t] = added
-        for part, more in zip((dd, dv, db, vv, vb, bb), added, strict=True):
-            part += more
-        if dd.min() < 0.0:
-            _mend(dd < 0.0, dd, dv, db, vv, vb, bb)
+        C += added
+        if least(C[0]) < 0.0:
+            _mend(C[0] < 0.0, *C)
         S = variance[k]
-        np.add(dd, R[k], out=S)
+        np.add(C[0], R[k], out=S)
         np.divide(used[k], S, out=inverse)
-        u0, u1, u2 = g0[k], g1[k], g2[k]
-        np.multiply(dd, inverse, out=u0)
-        np.multiply(dv, inverse, out=u1)
-        np.multiply(db, inverse, out=u2)
-        for part, gain, row in ((vv, u1, dv), (vb, u1, db), (bb, u2, db), (dv, u0, dv), (db, u0, db), (dd, u0, dd)):
-            np.multiply(gain, row, out=x)
-            part -= x
-        if np.minimum(vv, bb, out=x).min() < 0.0:
-            _mend(x < 0.0, dd, dv, db, vv, vb, bb)
+        u = gain[k]
+        multiply(known, inverse, out=u)
+        multiply(bd, u[1], out=pairs)
+        subtract(doubled, pairs, out=doubled)
+        multiply(even, u[2], out=x)
+        subtract(last, x, out=last)
+        multiply(known, u[0], out=tops)
+        subtract(known, tops, out=known)
+        if odd.min() < 0.0:
+            _mend((C[3] < 0.0) | (C[5] < 0.0), *C)
     variance[~used] = 1.0
     weight = np.sqrt(variance)
     np.divide(1.0, weight, out=weight)
     weight[~used] = 0.0
-    return Gains(g0, g1, g2, weight, variance, dt)
+    return Gains(gain, weight, variance, dt)
+
+
+def _ahead_of(t: Any) -> list[F64]:
+    """How the covariance after t seconds, dd dv db vv vb bb, follows from that before: of each of them but the first
+    what it adds to those in front of it, (j, 1) or (j, G) for t (G,)."""
+    h, t2 = 0.5 * t * t, t * t
+    columns = [[2 * t], [-2 * h, -t], [t2, t], [-2 * t * h, -(h + t2), t, -2 * t], [h * h, h * t, -h, t2, -t]]
+    return [np.reshape(np.array(column), (len(column), -1)) for column in columns]
 
 
 def _mend(bad: npt.NDArray[np.bool_], dd: F64, dv: F64, db: F64, vv: F64, vb: F64, bb: F64) -> None:
@@ -140,24 +145,31 @@ def whiten(g: Gains, s1: F64, s2: F64, z: F64) -> F64:
     """Normalised innovations (n, C, G) of C inputs: increments s1, s2 over the interval before, fixes z (n, C, G)."""
     n, C, G = z.shape
     out = np.zeros((n, C, G))
-    x_d, x_v, x_b = z[0].copy(), np.zeros((C, G)), np.zeros((C, G))
-    e, x = np.empty((C, G)), np.empty((C, G))
+    x = np.zeros((3, C, G))  # d, v, b
+    x[0] = z[0]
+    e, buffer = np.empty((C, G)), np.empty((3, C, G))
+    d, v, b, moved = x[0], x[1], x[2], x[:2]
+    one, two = buffer[0], buffer[:2]
+    gain, weight, multiply = g.gain[:, :, None], g.weight, np.multiply
+    behind: dict[float, F64] = {}
     for k, t in enumerate(_steps_of(g.dt)):
         if k == 0:
             continue
-        np.multiply(x_v, t, out=x)
-        x_d += x
-        np.multiply(x_b, 0.5 * t * t, out=x)
-        x_d -= x
-        x_d += s2[k]
-        np.multiply(x_b, t, out=x)
-        x_v -= x
-        x_v += s1[k]
-        np.subtract(z[k], x_d, out=e)
-        np.multiply(e, g.weight[k], out=out[k])
-        for state, gain in ((x_d, g.g0[k]), (x_v, g.g1[k]), (x_b, g.g2[k])):
-            np.multiply(gain, e, out=x)
-            state += x
+        multiply(v, t, out=one)
+        d += one
+        column = behind.get(t) if isinstance(t, float) else None
+        if column is None:
+            column = np.reshape(np.array([-0.5 * t * t, -t]), (2, 1, -1))
+            if isinstance(t, float):
+                behind[t] = column
+        multiply(column, b, out=two)
+        moved += two
+        d += s2[k]
+        v += s1[k]
+        np.subtract(z[k], d, out=e)
+        multiply(e, weight[k], out=out[k])
+        multiply(gain[k], e, out=buffer)
+        x += buffer
     return out
 
 
@@ -250,38 +262,46 @@ def fits(records: Sequence[tuple[Fixes, Accelerations]], *, r: float | None = No
         return []
     problems = [_Problem(fixes, accel, most) for fixes, accel in records]
     longest = max(p.n for p in problems)
-    same = all(p.n == longest and np.array_equal(p.dt, problems[0].dt) for p in problems)
     for span, count in ((6.0, 9), (1.5, 7), (0.4, 7), (0.12, 7)):
-        steps = np.linspace(-span, span, count)
-        a, b = (m.ravel() for m in np.meshgrid(steps, steps))
-        wide = 3 * a.size
-        G = wide * len(problems)
-        # behind a shorter record nothing happens: no time passes and no fix is there
-        s1, s2, z, ratio = (np.zeros((longest, G)) for _ in range(4))
-        std, walk = np.full((longest, G), np.inf), np.empty(G)
-        dt = problems[0].dt if same else np.zeros((longest, G))
-        trials = []
-        for i, p in enumerate(problems):
-            q = p.unit_q * 10.0 ** (p.centre[0] - (2.0 if span == 6.0 else 0.0) + a[:, None])
-            qb = p.unit_qb * 10.0 ** (p.centre[1] - (5.0 if span == 6.0 else 0.0) + b[:, None])
-            trials.append((q, qb))
-            k = slice(wide * i, wide * (i + 1))
-            for lanes, values in ((s1, p.s1), (s2, p.s2), (z, p.z), (std, p.std), (ratio, p.gap)):
-                lanes[: p.n, k].reshape(p.n, -1, 3)[:] = values[:, None]
-            ratio[:, k] += q.reshape(-1)  # a gap's noise is absolute: as if r were 1
-            walk[k] = qb.reshape(-1)
-            if not same:
-                dt[: p.n, k] = p.dt[:, None]
-        g = gains(dt, std, ratio, np.broadcast_to(walk, (longest, G)))
-        e = whiten(g, s1[:, None], s2[:, None], z[:, None])[:, 0]
-        for i, (p, (q, qb)) in enumerate(zip(problems, trials, strict=True)):
-            k = slice(wide * i, wide * (i + 1))
-            mine = e[: p.n, k], g.variance[: p.n, k], std[: p.n, k]
-            value, r_each = log_likelihood(*mine)
-            if r is not None:
-                value, r_each = fixed_likelihood(*mine, r), np.full(len(value), r)
-            p.choose(value.reshape(-1, 3), r_each.reshape(-1, 3), q, qb)
+        some = max(1, CELLS // (3 * count * count * longest))
+        for lo in range(0, len(problems), some):
+            _narrow(problems[lo : lo + some], span, count, r)
     return [p.found() for p in problems]
+
+
+def _narrow(problems: list[_Problem], span: float, count: int, r: float | None) -> None:
+    """Try `count` values of both ratios, `span` decades to both sides of each problem's best so far."""
+    longest = max(p.n for p in problems)
+    same = all(p.n == longest and np.array_equal(p.dt, problems[0].dt) for p in problems)
+    steps = np.linspace(-span, span, count)
+    a, b = (m.ravel() for m in np.meshgrid(steps, steps))
+    wide = 3 * a.size
+    G = wide * len(problems)
+    # behind a shorter record nothing happens: no time passes and no fix is there
+    s1, s2, z, ratio = (np.zeros((longest, G)) for _ in range(4))
+    std, walk = np.full((longest, G), np.inf), np.empty(G)
+    dt = problems[0].dt if same else np.zeros((longest, G))
+    trials = []
+    for i, p in enumerate(problems):
+        q = p.unit_q * 10.0 ** (p.centre[0] - (2.0 if span == 6.0 else 0.0) + a[:, None])
+        qb = p.unit_qb * 10.0 ** (p.centre[1] - (5.0 if span == 6.0 else 0.0) + b[:, None])
+        trials.append((q, qb))
+        k = slice(wide * i, wide * (i + 1))
+        for lanes, values in ((s1, p.s1), (s2, p.s2), (z, p.z), (std, p.std), (ratio, p.gap)):
+            lanes[: p.n, k].reshape(p.n, -1, 3)[:] = values[:, None]
+        ratio[:, k] += q.reshape(-1)  # a gap's noise is absolute: as if r were 1
+        walk[k] = qb.reshape(-1)
+        if not same:
+            dt[: p.n, k] = p.dt[:, None]
+    g = gains(dt, std, ratio, np.broadcast_to(walk, (longest, G)))
+    e = whiten(g, s1[:, None], s2[:, None], z[:, None])[:, 0]
+    for i, (p, (q, qb)) in enumerate(zip(problems, trials, strict=True)):
+        k = slice(wide * i, wide * (i + 1))
+        mine = e[: p.n, k], g.variance[: p.n, k], std[: p.n, k]
+        value, r_each = log_likelihood(*mine)
+        if r is not None:
+            value, r_each = fixed_likelihood(*mine, r), np.full(len(value), r)
+        p.choose(value.reshape(-1, 3), r_each.reshape(-1, 3), q, qb)
 
 
 def _some(fixes: Fixes, most: int) -> Fixes:

@@ -10,28 +10,35 @@ from html import escape
 
 import numpy as np
 
-from edge_agent.messages import F64, VALID_MODES, AccelFlag, Mode, Quality, S, Verdict
-from edge_agent.review.agree import CLOCK_S, Agreement
+from edge_agent.messages import F64, I64, VALID_MODES, AccelFlag, FusionFlag, Mode, Quality, S, Verdict
 from edge_agent.review.charts import (
     BLUE,
+    DARK,
     GREEN,
     GREY,
+    INK,
     MODE_COLOURS,
     ORANGE,
     PURPLE,
     QUALITY_COLOURS,
+    RAW,
     RED,
+    Lane,
     Plot,
     Scale,
     length,
     limits,
+    spread,
     table,
     time_scale,
     utc,
 )
+from edge_agent.review.estimates import Track
 from edge_agent.review.gather import Extreme, PointFigures, Review, gaps_of, modes_of
-from edge_agent.review.series import Envelope, Stream
+from edge_agent.review.received import Due, Marked
+from edge_agent.review.series import PIECE_S, Envelope, Stream
 from edge_agent.review.sources import differences
+from edge_agent.verify import Gap
 
 MM = 1e3
 AXES = "xyz"
@@ -45,8 +52,23 @@ BAD_EVENTS = (
 )  # fmt: skip
 SENSOR_EVENTS = (
     "ACCEL_SPIKE", "ACCEL_SPIKE_END", "ACCEL_STUCK", "ACCEL_STUCK_END", "ACCEL_SILENT", "ACCEL_SILENT_END",
-    "SAMPLES_LOST", "COUNTER_RESET", "COARSE_GGA", "NO_SEPARATION", "PORT_LOST", "PORT_OPEN", "SILENT", "GARBAGE",
+    "COUNTER_RESET", "COARSE_GGA", "NO_SEPARATION", "PORT_LOST", "PORT_OPEN", "SILENT", "GARBAGE",
 )  # fmt: skip
+FAMILIES = (
+    ("fixes against the filter", RED, ("JUMP_", "DATUM", "REACQUIRE", "OUTAGE_END", "CONTRADICTION", "HEADING_JUMP")),
+    ("accelerometers", ORANGE, ("ACCEL_", "SAMPLES_LOST", "COUNTER_RESET")),
+    ("receivers", BLUE, ("FLOAT_", "HEADING_", "COARSE_GGA", "FINE_GGA", "SEPARATION", "NO_SEPARATION")),
+    ("triggers, clips", PURPLE, ("TRIGGER", "CLIP")),
+    ("clocks", INK, ("CLOCK_STEP", "GNSS_TIME_STEP", "DATE_CHANGED", "WEEK_ROLLOVER")),
+    ("state of the filter", GREEN, ("START", "MODE", "REFERENCE", "ADOPTED")),
+    ("refused input, ports, disk, program", DARK, (
+        "REJECT", "LOSS", "PORT_", "SILENT", "GARBAGE", "BUS_OFF", "DISK_", "SPACE_SHORT", "RING_FULL", "RETENTION",
+        "WRITER_", "STATE_", "STATUS_", "HOOK_FAILED", "RECOVERED", "CRASH",
+    )),
+)  # fmt: skip
+"""Events of one colour: what they tell of, and how their kinds begin; each kind has a strip of its own."""
+LANES = 40
+"""Strips of events at most."""
 
 
 def mm(v: float, digits: int = 1) -> str:
@@ -75,6 +97,19 @@ def percent(share: float) -> str:
     return f"{min(max(100 * share, 0.01), 99.99):.2f} %"
 
 
+def bin_s(track: Track) -> float:
+    """Seconds of a bin of a track whose rows are of a piece each; where a file ends it is shorter."""
+    return PIECE_S * float(1 << track.folds)
+
+
+def whole(track: Track) -> tuple[I64, F64]:
+    """A track without bins that hold far less than the others do: the record's last seconds say little."""
+    counts = np.array([n for _, _, n in track.rows], np.float64)
+    t, values = track.columns()
+    good = counts > 0.3 * np.median(counts) if len(counts) else np.zeros(0, np.bool_)
+    return t[good], values[good]
+
+
 def break_of(e: Envelope, usual_ns: float) -> float:
     """Spans of an envelope further apart than this have a gap between them."""
     return max(1.5 * e.span_ns, 3.5 * usual_ns + e.span_ns)
@@ -88,46 +123,37 @@ def period(r: Review) -> Scale:
 
 
 def availability(r: Review) -> str:
-    """When each stream was there, in which mode or quality, and why not."""
-    out = []
+    """What was due and what came, when each stream was there in which mode, quality and state, and why not."""
+    out = [_due(r)]
     for name, p in r.points.items():
-        plot = Plot(period(r), Scale(0, 1, ""), 34)
-        rows = [
-            (float(a), float(b), MODE_COLOURS[Mode(m).name], f"{Mode(m).name} {utc(a)} {length((b - a) / S)}")
-            for a, b, m in p.spells
-        ]
-        plot.spans(rows)
+        total = sum(b - a for a, b, _ in p.spells) or 1
+        lanes = []
         for m in sorted({m for _, _, m in p.spells}):
-            plot.legend.append((MODE_COLOURS[Mode(m).name], "box", Mode(m).name.lower().replace("_", " ")))
-        out.append(plot.html(f"{name}: mode of the estimate", values=False))
+            mine = [(a, b) for a, b, k in p.spells if k == m]
+            note = percent(sum(b - a for a, b in mine) / total)
+            lanes.append(Lane(Mode(m).name.lower().replace("_", " "), note, MODE_COLOURS[Mode(m).name], _boxes(mine)))
+        lanes += _flags(r.received.states.get(name), FusionFlag, "flag: ")
+        out.append(_strips(r, f"{name}: mode and flags of the estimate", lanes))
     for name, receiver in r.overview.receivers.items():
-        if not receiver.stream.samples:
-            continue
-        plot = Plot(period(r), Scale(0, 1, ""), 34)
-        plot.spans(
-            [
-                (float(a), float(b), _quality_colour(q), f"{quality_name(q)} {utc(a)} {length((b - a) / S)}")
-                for a, b, q in receiver.spells
-            ]
-        )
+        lanes = []
         for q in sorted({q for _, _, q in receiver.spells}):
-            plot.legend.append((_quality_colour(q), "box", quality_name(q).lower()))
-        out.append(plot.html(f"{name}: fix quality", values=False))
+            note = f"{receiver.qualities.get(q, 0)} epochs"
+            mine = [(a, b) for a, b, k in receiver.spells if k == q]
+            lanes.append(Lane(quality_name(q).lower(), note, _quality_colour(q), _boxes(mine)))
+        out.append(_strips(r, f"{name}: quality of the fixes", lanes))
     for name, sensor in r.overview.accelerometers.items():
-        if not sensor.stream.samples:
-            continue
-        plot = Plot(period(r), Scale(0, 1, ""), 34)
-        plot.spans([(float(a), float(b), BLUE, "accelerations") for a, b in _covered(sensor.stream)])
-        plot.legend.append((BLUE, "box", "samples"))
-        out.append(plot.html(f"{name}: accelerations", values=False))
+        if sensor.stream.samples:
+            lanes = [Lane("samples", f"{sensor.stream.samples}", BLUE, _boxes(_covered(sensor.stream)))]
+            lanes += _flags(r.received.flags.get(name), AccelFlag, "flag: ")
+            out.append(_strips(r, f"{name}: samples and their flags", lanes))
     gaps = [(g.begin_ns, g.end_ns, "raw data, " + g.source, g.reason, g.text) for g in r.verdict.gaps]
     for name, p in r.points.items():
-        for a, b, why in absent(r, p):
+        for a, b, why in absent(r, p) if p.receiver else ():
             gaps.append((a, b, f"displacement, {name}", why, "no valid estimate"))
-    for kind, streams in (("fixes", r.overview.receivers), ("accelerations", r.overview.accelerometers)):
+    for kind, streams in (("epochs", r.overview.receivers), ("accelerations", r.overview.accelerometers)):
         for name, s in streams.items():
             gaps += [(a, b, f"{kind}, {name}", why.lower().replace("_", " "), "") for a, b, why in gaps_of(r, s.stream)]
-    gaps.sort()
+    gaps = [g for g in gaps if g[2].startswith("raw") or not _told_already(g, r.verdict.gaps)]
     longest = sorted(gaps, key=lambda g: g[0] - g[1])[:LISTED]
     rows_html = [
         [utc(a, 1), length((b - a) / S), escape(what), escape(why), escape(text)]
@@ -135,11 +161,108 @@ def availability(r: Review) -> str:
     ]
     if rows_html:
         more = f", the {LISTED} longest of {len(gaps)}" if len(gaps) > LISTED else ""
-        out.append(f"<h3>Gaps and their reasons{more}</h3>")
+        out.append(f"<h3>The long gaps and their reasons{more}</h3>")
         out.append(table(["begin [UTC]", "length", "what is missing", "reason", ""], rows_html))
+        out.append(f'<p class="small">{GAP} Listed: those above 1 s, and above 0.5 s of accelerometers.</p>')
+    elif any(due.lost for due in (*r.received.receivers.values(), *r.received.accelerometers.values())):
+        out.append(f'<p class="small">{GAP} None is longer than 1 s (accelerometers: 0.5 s).</p>')
     else:
         out.append("<p>No gap: every stream was there all the time.</p>")
     return "".join(out)
+
+
+def _told_already(gap: tuple[int, int, str, str, str], raw: list[Gap]) -> bool:
+    """Whether nearly all of a gap is one of the raw data of all ports."""
+    begin, end = gap[:2]
+    held = (min(end, g.end_ns) - max(begin, g.begin_ns) for g in raw if g.source == "all")
+    return max(held, default=0) > 0.9 * (end - begin)
+
+
+GAP = "A gap is a place where at least one epoch or sample is missing; all are counted in the table above."
+
+
+def _due(r: Review) -> str:
+    """Table of what was due, what came, what is missing and why."""
+    rows = []
+    for name, p in r.points.items():
+        if not p.receiver:
+            continue
+        why: dict[str, float] = {}
+        gone = absent(r, p)
+        for a, b, reason in gone:
+            why[reason] = why.get(reason, 0.0) + (b - a) / S
+        lost = max(r.seconds - min(p.valid.covered_ns / S, r.seconds), 0.0)
+        rows.append(
+            [
+                f"{escape(name)}: valid displacement",
+                length(r.seconds),
+                length(r.seconds - lost),
+                f"{length(lost)} ({percent(lost / r.seconds)})" if gone else "none",
+                f"{len(gone)}",
+                length(max(b - a for a, b, _ in gone) / S) if gone else "\u2013",
+                escape(", ".join(f"{k} {length(v)}" for k, v in sorted(why.items(), key=lambda i: -i[1]))),
+            ]
+        )
+    for what, found in (("epochs", r.received.receivers), ("samples", r.received.accelerometers)):
+        for name, due in found.items():
+            rows.append([f"{escape(name)}: {what}", str(due.expected), str(due.received), *missing_cells(due)])
+    absent_ones = [n for n in (*r.config.receivers, *r.config.accelerometers) if n not in _came(r)]
+    rows += [[escape(name), "\u2013", "0", "all", "", "", "nothing of it is in these files"] for name in absent_ones]
+    if not rows:
+        return ""
+    head = ["what", "expected", "received", "missing", "gaps", "longest gap", "why"]
+    return table(head, rows)
+
+
+def came(due: Due, what: str) -> str:
+    """How much of what was due came, in words; what is missing for want of a recording apart."""
+    lost, due_then = due.lost - due.unrecorded, due.expected - due.unrecorded
+    text = f"{due.received} of {due_then} {what}"
+    text += " due while it was recorded" if due.unrecorded else ""
+    return text + (f", {lost} missing ({percent(lost / due_then)})" if lost else ", none missing")
+
+
+def _came(r: Review) -> set[str]:
+    return {name for found in (r.received.receivers, r.received.accelerometers) for name, d in found.items()}
+
+
+def missing_cells(due: Due) -> list[str]:
+    """What is missing of a stream, in how many gaps, the longest, why."""
+    if not due.lost or due.longest is None:
+        return ["none", "0", "\u2013", ""]
+    why = sorted(due.missing.items(), key=lambda i: -i[1])
+    return [
+        f"{due.lost} ({percent(due.lost / due.expected)})",
+        f"{due.gaps}",
+        length((due.longest.end_ns - due.longest.begin_ns) / S),
+        escape(", ".join(f"{k} {n}" for k, n in why) if len(why) > 1 else why[0][0]),
+    ]
+
+
+def _boxes(stretches: list[tuple[int, int]]) -> list[tuple[float, float, str]]:
+    return [(float(a), float(b), f"{utc(a)} {length((b - a) / S)}") for a, b in stretches]
+
+
+def _flags(marked: Marked | None, names: type[AccelFlag] | type[FusionFlag], before: str = "") -> list[Lane]:
+    """A strip for each flag that stood."""
+    if marked is None:
+        return []
+    colours = (ORANGE, RED, PURPLE, DARK, INK)
+    kinds = [k for k in marked.kinds if marked.counts[k]]
+    out = []
+    for k in kinds:
+        name = str(names(k).name).lower().replace("_", " ")
+        note = f"{marked.counts[k]} samples"
+        out.append(Lane(before + name, note, colours[marked.kinds.index(k) % len(colours)], _boxes(marked.boxes(k))))
+    return out
+
+
+def _strips(r: Review, title: str, lanes: list[Lane]) -> str:
+    if not lanes:
+        return ""
+    plot = Plot(period(r), Scale(0, 1, ""))
+    plot.lanes(lanes)
+    return plot.html(title, values=False)
 
 
 def absent(r: Review, p: PointFigures) -> list[tuple[int, int, str]]:
@@ -193,10 +316,11 @@ def receivers(r: Review) -> str:
             for q, n in sorted(x.qualities.items(), key=lambda i: -i[1])
         )
         age = x.age.spans()[2]
+        due = r.received.receivers.get(name, Due())
         rows.append(
             [
                 escape(name),
-                f"{x.stream.samples}",
+                f"{x.stream.samples} of {due.expected - due.unrecorded}",
                 number(S / x.stream.usual_ns if x.stream.usual_ns else math.nan, 2),
                 shares,
                 f"{1e3 * float(latency.mean[0]):.0f} \u00b1 {1e3 * float(latency.std[0]):.0f}"
@@ -209,9 +333,17 @@ def receivers(r: Review) -> str:
             ]
         )
         frame = period(r)
+        t, share = whole(due.share)
+        if due.lost and len(t) >= 2:
+            came = 100 * share[:, 0]
+            plot = Plot(frame, Scale(min(90.0, math.floor(0.2 * float(came.min())) * 5 - 5.0), 101.0, "%"), 90)
+            text = f"epochs that came of those due, each {length(bin_s(due.share))}"
+            plot.bars(t, came, came, BLUE, text, big=len(t) < 60)
+            plot.level(100.0, GREEN, "all")
+            out.append(plot.html(f"{name}: epochs received"))
         t, lo, hi, _ = x.latency.spans()
         if len(t) and np.isfinite(lo).any():
-            plot = Plot(frame, Scale(*limits(1e3 * lo, 1e3 * hi), "ms"), 110)
+            plot = Plot(frame, Scale(*spread(1e3 * lo, 1e3 * hi), "ms"), 110)
             plot.bars(t, 1e3 * lo[:, 0], 1e3 * hi[:, 0], BLUE, "arrival less time of the fix")
             out.append(plot.html(f"{name}: latency"))
         t, lo, hi, _ = x.satellites.spans()
@@ -223,7 +355,7 @@ def receivers(r: Review) -> str:
         return ""
     head = [
         "receiver",
-        "fixes",
+        "epochs received",
         "rate [Hz]",
         "quality",
         "latency [ms]",
@@ -239,7 +371,11 @@ def receivers(r: Review) -> str:
 def displacement(r: Review) -> str:
     """Raw fixes, live fused displacement with its sd band, smoothed; per point and axis."""
     out = []
+    zooms = False
     for name, p in r.points.items():
+        if not p.receiver:
+            out.append(f"<p>{escape(name)}: {accelerometer_only(r, p)}.</p>")
+            continue
         point = r.overview.points[name]
         t, low, high, _ = point.displacement.spans()
         _, _, sd, _ = point.std.spans()
@@ -247,39 +383,83 @@ def displacement(r: Review) -> str:
             out.append(f"<p>{escape(name)}: no valid displacement in these files.</p>")
             continue
         far = break_of(point.displacement, p.valid.usual_ns)
-        position = r.overview.receivers.get(p.receiver)
+        receiver = r.overview.receivers.get(p.receiver)
+        sd = sd if len(sd) == len(t) else np.full(low.shape, math.nan)
         for axis in range(3):
-            d0, d1 = MM * low[:, axis], MM * high[:, axis]
-            band = 2 * MM * (sd[:, axis] if len(sd) == len(t) else np.full(len(t), math.nan))
-            shown = [d0 - band, d1 + band, d0, d1]
-            beyond = 0
-            if position is not None and position.stream.samples:
-                tz, z0, z1, _ = position.position.spans()
-                z0, z1 = MM * z0[:, axis], MM * z1[:, axis]
-                fine = np.isfinite(z0) & np.isfinite(z1) & (tz >= t[0]) & (tz <= t[-1])
-                if fine.sum() > 8:  # what most fixes span beside the estimate, not the wrong ones
-                    shown += [np.quantile(z0[fine], (0.02, 0.98)), np.quantile(z1[fine], (0.02, 0.98))]
-            y0, y1 = limits(*shown)
-            plot = Plot(period(r), Scale(y0, y1, "mm"), 200)
-            if position is not None and position.stream.samples:
-                beyond = int(((z0 < y0) | (z1 > y1)).sum())
-                plot.bars(tz, z0, z1, "#a9a9a9", "raw GNSS" + (f" ({beyond} spans reach beyond)" if beyond else ""))
-            plot.area(t, d0 - band, d1 + band, far, BLUE, "\u00b1 2 sd", 0.22)
-            plot.area(t, d0, d1, far, BLUE, "live, fused")
+            raw = smoothed = None
+            if receiver is not None and receiver.stream.samples:
+                tz, z0, z1, _ = receiver.position.spans()
+                raw = tz, MM * z0[:, axis], MM * z1[:, axis]
             ts, s0, s1, _ = p.smoothed.spans()
             if len(ts):
-                plot.area(
-                    ts, MM * s0[:, axis], MM * s1[:, axis], break_of(p.smoothed, p.valid.usual_ns), RED, "smoothed", 0.8
-                )
-            out.append(plot.html(f"{name} {AXES[axis]}: displacement"))
+                smoothed = ts, MM * s0[:, axis], MM * s1[:, axis], break_of(p.smoothed, p.valid.usual_ns)
+            live = t, MM * low[:, axis], MM * high[:, axis], 2 * MM * sd[:, axis], far
+            out.append(estimated(r, f"{name} {AXES[axis]}: displacement", "mm", 200, live, raw, smoothed))
+            zooms = True
         span = point.displacement.span_ns / S
         note = (
             f"Each span of {length(span)} is drawn from its least to its largest value."
             if span > 2 * p.valid.usual_ns / S
             else "Every sample is drawn."
         )
-        out.append(f'<p class="small">{note} Drag over a plot to zoom, double-click or \u201call\u201d to go back.</p>')
+        out.append(f'<p class="small">{escape(name)}: {note}</p>')
+    if zooms:
+        out.append(f'<p class="small">{ZOOMING}</p>')
     return "".join(out)
+
+
+ZOOMING = (
+    "The scale is that of the estimate; fixes beyond it are marked and counted at the edge. "
+    '<span class="screen">Zoom: drag over a plot, pinch, or turn the wheel with Ctrl held or after a click; \u2195 '
+    "shows every value, double-click or \u201call\u201d goes back. Plots over the period move together.</span>"
+)
+
+Spans = tuple[I64, F64, F64]
+
+
+def estimated(
+    r: Review,
+    title: str,
+    unit: str,
+    height: int,
+    live: tuple[I64, F64, F64, F64, float],
+    raw: Spans | None,
+    smoothed: tuple[I64, F64, F64, float] | None = None,
+    texts: tuple[str, str] = ("raw GNSS", "live, fused"),
+) -> str:
+    """What was measured under what was made of it: live is middles, least, largest, 2 sd and the step that is a gap.
+
+    The scale is that of the estimate and of what most measurements span beside it: a wrong fix must not flatten the
+    motion."""
+    t, low, high, band, far = live
+    shown = [*spread(low, high), *spread(low - band, high + band, share=0.05, reach=0.5)]
+    if smoothed is not None:
+        shown += spread(smoothed[1], smoothed[2])
+    if raw is not None:
+        fine = np.isfinite(raw[1]) & np.isfinite(raw[2]) & (raw[0] >= t[0]) & (raw[0] <= t[-1])
+        middle = 0.5 * (raw[1] + raw[2])[fine]
+        if len(middle) > 8:  # 4 sd of their noise, from neighbours: Gaussian noise has few beyond
+            noise = 1.4826 * float(np.median(np.abs(np.diff(middle)))) / math.sqrt(2.0)
+            inside = middle[(middle > min(shown) - 4 * noise) & (middle < max(shown) + 4 * noise)]
+            shown += [float(inside.min()), float(inside.max())] if len(inside) else []
+    plot = Plot(period(r), Scale(*limits(np.array(shown), room=0.03), unit), height)
+    if raw is not None:
+        plot.bars(*raw, RAW, texts[0], loose=True)
+    plot.area(t, low - band, high + band, far, BLUE, "\u00b1 2 sd", 0.22)
+    plot.area(t, low, high, far, BLUE, texts[1])
+    if smoothed is not None:
+        plot.area(*smoothed, RED, "smoothed", 0.8)
+    return plot.html(title)
+
+
+def accelerometer_only(r: Review, p: PointFigures) -> str:
+    """What there is of a point without a receiver, in words."""
+    rms = r.received.rms(p.accelerometer)
+    text = "accelerometer only: vibration, no displacement"
+    if np.isfinite(rms).all():
+        told = " / ".join(f"{1e3 * v:.3g}" for v in rms.tolist())
+        text += f"; accelerations x / y / z {told} mm/s\u00b2 rms about the mean of each half minute"
+    return text
 
 
 def _extreme(e: Extreme | None) -> str:
@@ -287,7 +467,7 @@ def _extreme(e: Extreme | None) -> str:
 
 
 def extremes(r: Review) -> str:
-    """Least and largest displacement with sd and time, and a close look at the furthest."""
+    """Least and largest displacement with sd and time, and a close look at the furthest from the reference."""
     rows, out = [], []
     for name, p in r.points.items():
         if not p.moments.n:
@@ -317,15 +497,22 @@ def extremes(r: Review) -> str:
             far = 5.0 * float(np.median(np.diff(c.utc_ns)))
             plot.area(c.utc_ns, d - sd, d + sd, far, BLUE, "\u00b1 2 sd", 0.22)
             plot.line(c.utc_ns, d, BLUE, "live, fused, every sample", far)
-            title = f"{name} {AXES[c.axis]}: around its furthest displacement, {utc(int(c.utc_ns[0]))[:10]}"
+            title = f"{name} {AXES[c.axis]}: around its furthest from the reference, {utc(int(c.utc_ns[0]))[:10]}"
             out.append(plot.html(title))
     if not rows:
         return ""
     head = [
-        "point", "axis", "least [mm]", "largest [mm]", "range [mm]", "mean [mm]", "rms about mean [mm]",
+        "point", "axis", "least [mm]", "largest [mm]", "peak to peak [mm]", "mean [mm]", "rms about mean [mm]",
         "sd live [mm]", "sd smoothed [mm]",
     ]  # fmt: skip
-    return table(head, rows, 7) + f'<div class="grid3">{"".join(out)}</div>'
+    text = (
+        "Displacement counts from the reference, which is zero: least, largest and furthest are of that. Peak to peak "
+        "is the largest less the least."
+    )
+    doubt = [escape(name) for name, p in r.points.items() if p.moments.n and p.agreement and p.agreement.in_doubt]
+    if doubt:
+        text += f" In doubt for {', '.join(doubt)}: receiver and accelerometer contradict each other there."
+    return table(head, rows, 7) + f'<div class="grid3">{"".join(out)}</div><p class="small">{text}</p>'
 
 
 # ------------------------------------------------------------------------------------------------------------- verdicts
@@ -351,9 +538,19 @@ def gate(r: Review) -> str:
                 " / ".join(mm(float(v)) for v in step) if p.gated else "\u2013",
             ]
         )
+        marked = r.received.verdicts.get(name)
+        if marked is not None:
+            colours = (RED, ORANGE, PURPLE, INK, GREEN)
+            near = 1.5 * r.received.receivers.get(p.receiver, Due()).interval_ns  # one epoch after the other
+            lanes = [
+                Lane(Verdict(v).name.lower(), f"{marked.counts[v]} fixes", colour, _boxes(marked.boxes(v, near)))
+                for v, colour in zip(marked.kinds, colours, strict=True)
+                if marked.counts[v]
+            ]
+            out.append(_strips(r, f"{name}: fixes that were not simply taken", lanes))
         t, _, high, _ = point.ratio.spans()
         if len(t):
-            y = np.log10(np.maximum(high[:, 0], 1e-3))
+            y = np.log10(np.maximum(high[:, 0], 1e-2))
             plot = Plot(period(r), Scale(-2.0, max(1.0, float(np.nanmax(y)) + 0.2), "ratio", log=True), 130)
             plot.bars(t, y, y, GREY, "largest of each span")
             above = high[:, 0] > 1
@@ -367,7 +564,7 @@ def gate(r: Review) -> str:
                 a, b = MM * low[:, axis], MM * high[:, axis]
                 sd = MM * float(p.std_residual_m[axis])
                 plot = Plot(period(r), Scale(*_most(a, b, sd), "mm"), 110)
-                plot.bars(t, a, b, GREY, "fix less prediction")
+                plot.bars(t, a, b, GREY, "fix less prediction", loose=True)
                 if sd:
                     plot.level(2 * sd, BLUE, "\u00b1 2 sd as predicted, mean")
                     plot.level(-2 * sd, BLUE, "")
@@ -390,33 +587,51 @@ def _most(a: F64, b: F64, sd: float) -> tuple[float, float]:
     return -far, far
 
 
+def family(kind: str) -> int:
+    """Which of FAMILIES a kind of event belongs to; their number for one of none."""
+    found = ((len(start), i) for i, f in enumerate(FAMILIES) for start in f[2] if kind.startswith(start))
+    return max(found, default=(0, len(FAMILIES)))[1]
+
+
 def events(r: Review) -> str:
-    """Jumps, datum events, triggers, clips and whatever else was told, in the order of time."""
-    told = [h for h in r.overview.happened if h.kind not in ("SAMPLES_LOST", "LOSS")]
-    if not told and not r.overview.kinds:
+    """A strip for each kind of event and fault, and the list of them in the order of time."""
+    seen = r.received.events
+    if not seen:
         return "<p>Nothing happened that the agent would have told.</p>"
-    counts = ", ".join(f"{escape(k)} {n}" for k, n in sorted(r.overview.kinds.items(), key=lambda i: -i[1]))
+    lanes = []
+    used = set()
+    for kind, source in sorted(seen, key=lambda k: (family(k[0]), k)):
+        stretches, which = seen[kind, source], family(kind)
+        used.add(which)
+        colour = FAMILIES[which][1] if which < len(FAMILIES) else GREY
+        name = f"{kind.lower().replace('_', ' ')}, {source}" if source else kind.lower().replace("_", " ")
+        times = "once" if stretches.count == 1 else f"{stretches.count} times"
+        lanes.append(Lane(name, times, colour, _boxes(stretches.boxes)))
+    plot = Plot(period(r), Scale(0, 1, ""))
+    plot.lanes(lanes[:LANES])
+    plot.legend = [(f[1], "box", f[0]) for i, f in enumerate(FAMILIES) if i in used]
+    if len(FAMILIES) in used:
+        plot.legend.append((GREY, "box", "other"))
+    told = [h for h in r.overview.happened if h.kind not in ("SAMPLES_LOST", "LOSS")]
     first = sorted(told, key=lambda h: (h.kind not in BAD_EVENTS and "TRIGGER" not in h.kind, h.begin_ns))[:LISTED]
     rows = [
         [
             utc(h.begin_ns, 1),
             length((h.end_ns - h.begin_ns) / S) if h.end_ns > h.begin_ns else "",
-            escape(h.kind),
+            escape(h.kind.lower().replace("_", " ")),
             escape(h.source),
             escape(h.text),
             escape(", ".join(f"{k} {v:.4g}" for k, v in list(h.values.items())[:4])),
         ]
         for h in sorted(first, key=lambda h: h.begin_ns)
     ]
-    more = f" ({len(told)} in all, the JSON twin lists them)" if len(told) > LISTED else ""
-    plot = Plot(period(r), Scale(0, 1, ""), 34)
-    for h in first:
-        bad = h.fault or h.kind in BAD_EVENTS
-        colour = PURPLE if "TRIGGER" in h.kind or h.kind == "CLIP" else RED if bad else GREY
-        plot.spans([(float(h.begin_ns), float(max(h.end_ns, h.begin_ns)), colour, f"{h.kind} {h.source}: {h.text}")])
-    plot.legend = [(RED, "box", "trouble"), (PURPLE, "box", "trigger, clip"), (GREY, "box", "other")]
     head = ["UTC", "length", "event", "source", "", "values"]
-    return f"<p>{counts}{more}</p>" + plot.html("events", values=False) + table(head, rows)
+    listed = "Listed: all but samples lost, refused input and losses, which have sections of their own"
+    if len(told) > LISTED:
+        listed = f"Listed: {LISTED} of {len(told)}, trouble and triggers first; the JSON twin has more"
+    more = f" The first {LANES} of {len(lanes)} kinds are drawn." if len(lanes) > LANES else ""
+    shown = table(head, rows) + f'<p class="small">{listed}.{more}</p>' if rows else ""
+    return plot.html("Events and faults", values=False) + shown
 
 
 def losses(r: Review) -> str:
@@ -425,13 +640,12 @@ def losses(r: Review) -> str:
     for f in r.verdict.files:
         for source, where, count, _, _ in f.losses:
             lost[source, where] = lost.get((source, where), 0) + count
-    samples: dict[str, int] = {}
-    for h in r.overview.happened:
-        if h.kind == "SAMPLES_LOST":
-            n = next(iter(h.values.values()), 1.0)
-            samples[h.source] = samples.get(h.source, 0) + int(n)
     rows = [[escape(s), escape(w), str(n), "told by the agent"] for (s, w), n in sorted(lost.items())]
-    rows += [[escape(s), "before the bus", str(n), "by the sample counter"] for s, n in sorted(samples.items())]
+    for what, found in (("epochs", r.received.receivers), ("samples", r.received.accelerometers)):
+        how = "by their times" if what == "epochs" else "by the sample counter, else by their times"
+        rows += [
+            [escape(s), f"{what}: {escape(w)}", str(n), how] for s, d in found.items() for w, n in d.missing.items()
+        ]
     rows += [
         [escape(s), f"refused: {escape(w)}", str(n), "input as it came"] for (s, w), n in sorted(r.rejects.items())
     ]
@@ -456,12 +670,13 @@ def sensors(r: Review) -> str:
     for name, a in r.overview.accelerometers.items():
         s = a.stream
         if not s.samples:
-            rows.append([escape(name), "0", "\u2013", "\u2013", "no sample in these files", ""])
+            rows.append([escape(name), "0", "\u2013", "\u2013", "\u2013", "\u2013", "no sample in these files", ""])
             continue
+        due = r.received.accelerometers.get(name, Due())
         flags = ", ".join(
             f"{AccelFlag(v).name.lower().replace('_', ' ')} {n}"  # type: ignore[union-attr]
             for v, n in sorted(a.flags.items())
-            if v != AccelFlag.FITTED
+            if v not in (AccelFlag.FITTED, AccelFlag.GAP_BEFORE)
         )
         seen = ", ".join(f"{k} {n}" for (source, k), n in sorted(watched.items()) if source == name)
         rows.append(
@@ -469,7 +684,9 @@ def sensors(r: Review) -> str:
                 escape(name),
                 str(s.samples),
                 number(S * (s.samples - 1) / max(s.covered_ns, 1), 2),
-                f"{len(s.silences) + s.more}",
+                f"{due.lost - due.unrecorded} of {due.expected - due.unrecorded}",
+                f"{due.gaps}",
+                " / ".join(f"{1e3 * v:.3g}" for v in r.received.rms(name).tolist()),
                 flags or "none",
                 escape(seen) or "nothing",
             ]
@@ -477,25 +694,32 @@ def sensors(r: Review) -> str:
         t, low, high, _ = a.xyz.spans()
         mean = np.nanmean((low + high) / 2, axis=0)
         low, high = low - mean, high - mean
-        plot = Plot(period(r), Scale(*limits(low, high), "m/s\u00b2"), 150)
+        plot = Plot(period(r), Scale(*spread(low, high), "m/s\u00b2"), 150)
         for axis, colour in enumerate((BLUE, ORANGE, GREEN)):
             shown = 0.75 if axis else 1.0
             plot.area(t, low[:, axis], high[:, axis], break_of(a.xyz, s.usual_ns), colour, AXES[axis], shown)
         about = " / ".join(number(float(v), 3) for v in mean)
         out.append(plot.html(f"{name}: accelerations about {about} m/s\u00b2"))
+        shaking = r.received.shaking.get(name, Track())
+        width = bin_s(shaking)
+        t, square = whole(shaking)
+        if len(t) >= 3:
+            rms = 1e3 * np.sqrt(square)
+            plot = Plot(period(r), Scale(*spread(rms, np.zeros(1)), "mm/s\u00b2"), 110)
+            for axis, colour in enumerate((BLUE, ORANGE, GREEN)):
+                plot.line(t, rms[:, axis], colour, AXES[axis], 3.5 * width * S)
+                plot.bars(t, rms[:, axis], rms[:, axis], colour, "", big=len(t) < 60)
+            out.append(plot.html(f"{name}: rms of the accelerations about their mean, each {length(width)}"))
     if not rows:
         return ""
-    head = ["accelerometer", "samples", "rate [Hz]", "gaps", "flagged samples", "noticed"]
+    head = [
+        "accelerometer", "samples", "rate [Hz]", "missing", "gaps", "rms x / y / z [mm/s\u00b2]", "flagged samples",
+        "noticed",
+    ]  # fmt: skip
     return table(head, rows) + "".join(out)
 
 
 # ------------------------------------------------------------------------------------------------- what is asked closer
-
-
-def offset_known(a: Agreement) -> bool:
-    """Whether the offset may be told: where the sensors agree as they are, one far from zero is a chance hit."""
-    o = a.offset
-    return o.observable and (a.verdict == "CONTRADICTION" or abs(o.value_s) < max(CLOCK_S, 3 * o.std_s))
 
 
 # ------------------------------------------------------------------------------------------------------ place, settings

@@ -10,8 +10,9 @@ from edge_agent.messages import F64, S
 from edge_agent.review.charts import (
     BLUE,
     GREEN,
+    INK,
     ORANGE,
-    PURPLE,
+    RAW,
     RED,
     Plot,
     Scale,
@@ -23,12 +24,12 @@ from edge_agent.review.charts import (
 from edge_agent.review.checks import OVERLAY_S, Apart, Checks, liveliest
 from edge_agent.review.gather import Busy, Review
 from edge_agent.review.integrate import Overlay
-from edge_agent.review.panels import AXES, MM, mm, number, offset_known
+from edge_agent.review.panels import AXES, MM, mm, number
 from edge_agent.review.splits import Split
+from edge_agent.review.witness import Windows
 
 SHOWN_S = 30.0
 """Seconds of a close look at the split, and at second differences half of it."""
-RAW = "#a9a9a9"
 
 
 def agreement(r: Review) -> str:
@@ -44,18 +45,46 @@ def agreement(r: Review) -> str:
             out.append(f"<p>{escape(name)}: not compared, {escape(why.removeprefix('sensors not compared: '))}.</p>")
             continue
         o, m = a.offset, a.mounting
-        known = offset_known(a)
-        offset = f"{number(1e3 * o.value_s, 1)} \u00b1 {1e3 * o.std_s:.1f} ms" if known else "not observable"
-        if not o.observable:
-            offset = escape(o.why)
+        offset = f"{number(1e3 * o.value_s, 1)} \u00b1 {1e3 * o.std_s:.1f} ms" if o.observable else escape(o.why)
         yaw = escape(m.why)
         if m.observable:
             yaw = f"{number(m.yaw_deg, 1)} \u00b1 {m.std_yaw_deg:.1f}\u00b0, {' '.join(m.axes)}"
         rows.append([escape(name), escape(a.verdict.lower()), escape(a.text), offset, yaw])
+        if p.busy is not None and len(a.windows.share):
+            out.append(_windows(name, a.windows, p.busy.utc_minus_ns))
     if rows:
         head = ["point", "verdict", "", "add to the accelerometer\u2019s time", "yaw and axes"]
         out.insert(0, table(head, rows))
+        text = (
+            "Of the liveliest minutes. Windows: how much of the motion that the accelerations tell, as they are "
+            "configured, the fixes show: 100 % where both see one motion, 0 where they see two (\u00b1 2 sd). "
+            "Windows in which the accelerometer tells no more than its own noise have no say. Log likelihood: of the "
+            "fixes with the accelerometer less without, by a filter that is quick enough to follow without it. One "
+            "window proves nothing: a blow that the samples missed or a wrong fix speaks against sound sensors too; "
+            "the verdict is that of most windows, or of a clock or mounting by which most of them gain."
+        )
+        out.append(f'<p class="small">{text}</p>')
     return "".join(out)
+
+
+def _windows(name: str, w: Windows, utc_minus_ns: int) -> str:
+    """Share of the told motion that the fixes show, in time."""
+    t0, t1 = w.begin_ns + utc_minus_ns, w.end_ns + utc_minus_ns
+    y, sd = 100.0 * w.share, 200.0 * w.std
+    said = w.loud & (sd < 200.0)
+    frame = time_scale(int(t0[0]), int(t1[-1]))
+    plot = Plot(
+        frame, Scale(*limits(np.clip(y - sd, -250, 250)[said], np.array([-10.0, 110.0])), "%"), 130, 4, alone=True
+    )
+    for a, b, v, s in zip(t0[said].tolist(), t1[said].tolist(), y[said].tolist(), sd[said].tolist(), strict=True):
+        edges = np.array([a, b], np.int64)
+        plot.area(edges, np.full(2, v - s), np.full(2, v + s), float("inf"), BLUE, "\u00b1 2 sd", 0.3)
+        plot.line(edges, np.full(2, v), BLUE, "told motion that the fixes show")
+    plot.level(100.0, GREEN, "they see one motion")
+    plot.level(0.0, RED, "they see different ones")
+    some = f"{int(w.favour.sum())} speak for the accelerometer, {int(w.against.sum())} against"
+    total = f"log likelihood with less without {number(float(w.support.sum()), 0)}"
+    return plot.html(f"{name}: {len(w.share)} windows, {some}; {total}")
 
 
 def integration(r: Review) -> str:
@@ -79,6 +108,12 @@ def integration(r: Review) -> str:
         out.append('<div class="grid3">')
         out += [_second(name, c, busy, axis) for axis in range(3)]
         out.append("</div>")
+        apart, n = c.second_way
+        if n:
+            out.append(
+                f'<p class="small">{escape(name)}: the smoothed displacement, computed a second way over {n} fixes '
+                f"(two filters, one forward, one backward), differs by {MM * apart:.1g} mm at most.</p>"
+            )
         if c.overlay is not None:
             out.append(f"<h3>{escape(name)}: accelerations integrated twice</h3>" + '<div class="grid3">')
             out += [_overlay(name, c, c.overlay, busy, axis) for axis in range(3)]
@@ -176,9 +211,9 @@ def _split(name: str, s: Split, a: Apart, busy: Busy, k: slice, axis: int) -> st
         return np.asarray(MM * (x[k, axis] + np.median(a.live_m[k, axis] - x[k, axis])))
 
     curves = [
+        (moved(s.displacement_m), INK, "merged"),
         (moved(s.g_type_m), ORANGE, "G-type"),
         (moved(s.d_type_m), GREEN, "D-type"),
-        (moved(s.displacement_m), PURPLE, "merged"),
         (MM * a.live_m[k, axis], BLUE, "live filter"),
     ]
     plot = Plot(time_scale(int(t[0]), int(t[-1])), Scale(*limits(*(c[0] for c in curves)), "mm"), 170, alone=True)
@@ -186,5 +221,5 @@ def _split(name: str, s: Split, a: Apart, busy: Busy, k: slice, axis: int) -> st
     near = (t_z + offset >= t[0]) & (t_z + offset <= t[-1]) & busy.taken
     plot.bars(t_z[near] + offset, MM * z[near, axis], MM * z[near, axis], RAW, "raw GNSS")
     for y, colour, text in curves:
-        plot.line(t, y, colour, text)
+        plot.line(t, y, colour, text, broad=colour == INK)
     return plot.html(f"{name} {AXES[axis]}: split at {number(s.critical_hz, 3)} Hz, {utc(int(t[0]))[:10]}")

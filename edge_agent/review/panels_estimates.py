@@ -9,10 +9,11 @@ from html import escape
 import numpy as np
 
 from edge_agent.messages import F64, I64, S, Verdict
-from edge_agent.review.charts import BLUE, GREEN, GREY, ORANGE, RED, Plot, Scale, limits, table, utc
+from edge_agent.review.agree import CLOCK_S
+from edge_agent.review.charts import BLUE, GREEN, GREY, ORANGE, RED, Plot, Scale, length, limits, table, utc
 from edge_agent.review.estimates import BINS, Gated, Headed
 from edge_agent.review.gather import Review
-from edge_agent.review.panels import AXES, MM, break_of, mm, number, percent, period
+from edge_agent.review.panels import AXES, MM, bin_s, break_of, estimated, mm, number, percent, period
 from edge_agent.review.series import Envelope
 
 LEAST = 100
@@ -62,18 +63,10 @@ def _heading(r: Review, name: str, h: Headed) -> str:
     t, low, high, _ = h.estimate.spans()
     tm, m0, m1, _ = h.measured.spans()
     sd = h.std.spans()[2][:, 0] if len(h.std.spans()[0]) == len(t) else np.full(len(t), math.nan)
-    at = h.first_deg
-    e0, e1 = at + low[:, 0], at + high[:, 0]
-    fine = np.isfinite(m0[:, 0])
-    shown = [e0 - 2 * sd, e1 + 2 * sd]
-    if fine.sum() > 8:
-        shown += [at + np.quantile(m0[fine], (0.02, 0.98)), at + np.quantile(m1[fine], (0.02, 0.98))]
-    plot = Plot(period(r), Scale(*limits(*shown), "deg"), 180)
-    far = 5.0 * float(np.median(np.diff(t))) if len(t) > 1 else math.inf
-    plot.bars(tm, at + m0[:, 0], at + m1[:, 0], "#a9a9a9", "as the receiver says")
-    plot.area(t, e0 - 2 * sd, e1 + 2 * sd, far, BLUE, "\u00b1 2 sd", 0.22)
-    plot.area(t, e0, e1, far, BLUE, "estimate")
-    return plot.html(f"{name}: heading")
+    at, far = h.first_deg, 5.0 * float(np.median(np.diff(t))) if len(t) > 1 else math.inf
+    live = t, at + low[:, 0], at + high[:, 0], 2 * sd, far
+    raw = tm, at + m0[:, 0], at + m1[:, 0]
+    return estimated(r, f"{name}: heading", "deg", 180, live, raw, None, ("as the receiver says", "estimate"))
 
 
 def honest_words(g: Gated) -> str:
@@ -131,19 +124,20 @@ def honesty(r: Review) -> str:
             low, high = limits(y, np.array([-0.5, 0.5]))
             plot = Plot(period(r), Scale(low, high, "ratio", log=True), 130, 4)
             plot.bars(t, y0, y1, BLUE, "\u00b1 2 sd of chance", opacity=0.35)
-            plot.bars(t, y, y, BLUE, "mean of each minute or more", big=len(t) < 60)
+            plot.bars(t, y, y, BLUE, f"mean of each {length(bin_s(g.nis))}", big=len(t) < 60)
             plot.level(0.0, RED, "honest")
             out.append(plot.html(f"{name}: innovation\u00b2 / variance in time"))
     if not rows:
         return "<p>Not told: no fix came to the gate in these files.</p>"
     head = [
-        "point", "the sd is", "innovation\u00b2 / variance", "likeness of neighbours x / y / z", "refused",
+        "point", "the sd is", "innovation\u00b2 / variance", "likeness of neighbours x / y / z", "beyond the gate",
         "expected of an honest filter",
     ]  # fmt: skip
     text = (
         "Innovation: fix less prediction; its square over its variance is 1 in the mean where the sd is honest (\u00b1 "
         "sd of chance), and the bars are then level. Bars that rise to the right: too sure; to the left: too careful. "
-        "Wrong fixes stand in the last bar; fixes that were used less an open jump are left out."
+        "Wrong fixes stand in the last bar. Here count the fixes that were taken and those beyond the gate; fixes used "
+        "less an open level are left out."
     )
     return table(head, rows) + f'<div class="grid3">{"".join(out)}</div><p class="small">{text}</p>'
 
@@ -270,7 +264,7 @@ def clocks(r: Review) -> str:
         if len(t) >= 3:
             ppm = 1e6 * (hz[:, 0] / (nominal or mean) - 1.0)
             plot = Plot(period(r), Scale(*limits(ppm, np.array([-0.1, 0.1]), room=0.2), "ppm"), 110, 4)
-            plot.bars(t, ppm, ppm, BLUE, "median of each minute", big=len(t) < 60)
+            plot.bars(t, ppm, ppm, BLUE, f"median of each {length(bin_s(track))}", big=len(t) < 60)
             out.append(plot.html(f"{name}: rate against {'the nominal' if nominal else 'its mean'}"))
     for name in r.overview.accelerometers:
         if name not in r.estimates.rates and r.overview.accelerometers[name].stream.samples:
@@ -278,17 +272,17 @@ def clocks(r: Review) -> str:
     for name, x in r.overview.receivers.items():
         if not x.stream.samples:
             continue
-        heads = [h.latencies[name] for h in r.estimates.heads if name in h.latencies]
-        value = f"{1e3 * heads[-1][0]:.0f} ms, {heads[-1][1]}" if heads else "not recorded"
-        latency = r.latency[name]
-        seen = f"in these files {1e3 * float(latency.mean[0]):.0f} \u00b1 {1e3 * float(latency.std[0]):.0f} ms"
-        rows.append([escape(name), value, "latency of its fixes", seen if latency.n else ""])
+        rows += _latency(r, name)
     for name, p in r.points.items():
         a = p.agreement
         if a is not None and a.offset.observable:
             o = a.offset
             value = f"{1e3 * o.value_s:+.1f} \u00b1 {1e3 * o.std_s:.1f} ms".replace("-", "\u2212")
-            rows.append([escape(name), value, "to be added to the accelerometer\u2019s time, by the motion itself", ""])
+            set_it = "nothing to set: it is within its sd, or below what latencies are known to"
+            if abs(o.value_s) > max(3 * o.std_s, CLOCK_S):
+                set_it = "the clocks differ: <code>edge-agent tune</code> tells whether a latency mends it"
+            what = "estimated by the motion itself: to be added to the accelerometer\u2019s time"
+            rows.append([escape(name), value, what, set_it])
         elif a is not None:
             rows.append(
                 [escape(name), "not observable", "offset between receiver and accelerometer", escape(a.offset.why)]
@@ -306,9 +300,40 @@ def clocks(r: Review) -> str:
         "stand under \u201cDo the sensors agree?\u201d."
     )
     return (
-        table(["clock", "estimate", "what", ""], rows)
+        table(["clock", "value", "what", "to set"], rows)
         + f'<div class="grid3">{"".join(out)}</div><p class="small">{text}</p>'
     )
+
+
+def _latency(r: Review, name: str) -> list[list[str]]:
+    """What was taken for the latency of a receiver's fixes before there was an estimate, what it was by the host's
+    clock, and what to set."""
+    rows = []
+    heads = [h.latencies[name] for h in r.estimates.heads if name in h.latencies]
+    ticks = sum(c.ticks for c in r.estimates.clocks.values())
+    known = ticks > 0 and sum(c.synchronised for c in r.estimates.clocks.values()) > 0.5 * ticks
+    how = heads[-1][1] if heads else ""
+    latency = r.latency[name]
+    if heads:
+        first = "at the head of the only file" if len(r.estimates.heads) == 1 else "at the head of the last file"
+        unused = known and latency.n and how == "assumed"
+        note = "replaced as soon as the host\u2019s clock told it, see below" if unused else ""
+        rows.append([escape(name), f"{how} {1e3 * heads[-1][0]:.0f} ms", f"latency of its fixes, {first}", note])
+    if not latency.n:
+        return rows
+    mean, sd = 1e3 * float(latency.mean[0]), 1e3 * float(latency.std[0])
+    if how == "configured":
+        told, note = "as configured, with the jitter of the arrivals", ""
+    elif known:
+        told = "estimated by the host\u2019s synchronised clock, mean and sd of one fix"
+        note = (
+            f"for hours without a synchronised clock set <code>receivers.{escape(name)}.latency_ms: {mean:.0f}</code>"
+        )
+    else:
+        told = f"{how or 'assumed'}, with the jitter of the arrivals: no synchronised clock measured it"
+        note = f"set <code>receivers.{escape(name)}.latency_ms</code> to what the receiver\u2019s handbook says"
+    rows.append([escape(name), f"{mean:.0f} \u00b1 {sd:.0f} ms", f"latency of its fixes in these files: {told}", note])
+    return rows
 
 
 def _usual(t: I64) -> float:

@@ -16,6 +16,7 @@ from edge_agent.review.charts import (
     GREY,
     ORANGE,
     PURPLE,
+    RAW,
     RED,
     Plot,
     Scale,
@@ -26,8 +27,9 @@ from edge_agent.review.charts import (
     time_scale,
     utc,
 )
-from edge_agent.review.gather import PointFigures, Review
+from edge_agent.review.gather import PEAK_DB, PointFigures, Review
 from edge_agent.review.panels import AXES, MM, mm, number, percent, period, with_sd
+from edge_agent.review.spectra import BOTTOM_DB
 
 TRACKED = 3
 """Parts of the record at least, for a frequency to be drawn in time."""
@@ -45,15 +47,15 @@ def frequencies(r: Review) -> str:
                 f"{100 * f.damping:.2f} \u00b1 {100 * f.std_damping:.2f}" if math.isfinite(f.damping) else "\u2013",
                 f.axes,
                 number(f.above_db, 0),
-                number(f.fused_hz, 3),
-                number(f.gnss_hz, 3),
+                _peak(f.freq_hz, f.fused_hz, p.fused_spectrum),
+                _peak(f.freq_hz, f.gnss_hz, p.gnss_spectrum),
             ]
             for f in p.frequencies
         ]
         if rows:
             head = [
                 "accelerations [Hz]", "damping [%]", "axes", "above floor [dB]", "fused displacement [Hz]",
-                "raw GNSS [Hz]",
+                "accepted fixes [Hz]",
             ]  # fmt: skip
             out.append(f"<h3>{escape(name)}</h3>" + table(head, rows))
         elif p.accel_spectrum is not None:
@@ -61,21 +63,41 @@ def frequencies(r: Review) -> str:
         if p.accel_spectrum is not None:
             s = p.accel_spectrum
             out.append(_density(f"{name}: accelerations", "(m/s\u00b2)\u00b2/Hz", [(s, "", "")], p))
-        parts = [(s, c, t) for s, c, t in ((p.gnss_spectrum, GREY, "raw GNSS"), (p.fused_spectrum, BLUE, "fused")) if s]
+        parts = [
+            (s, c, t) for s, c, t in ((p.gnss_spectrum, GREY, "accepted fixes"), (p.fused_spectrum, BLUE, "fused")) if s
+        ]
         for axis in range(3):
             if parts:
                 out.append(_density(f"{name} {AXES[axis]}: displacement", "mm\u00b2/Hz", parts, p, axis))
         out.append(_tracks(r, name, p))
         used = [s for s in (p.accel_spectrum, p.fused_spectrum, p.gnss_spectrum) if s is not None]
         if used:
-            text = ", ".join(f"{s.segments} segments of {length(1 / float(s.freq_hz[1]))}" for s in used[:1])
+            each = [(p.accel_spectrum, "accelerations"), (p.fused_spectrum, "fused"), (p.gnss_spectrum, "fixes")]
+            text = ", ".join(
+                f"{what} {s.segments} segments of {length(1 / float(s.freq_hz[1]))}"
+                for s, what in each
+                if s is not None
+            )
             out.append(
-                f'<p class="small">Welch\u2019s densities, Hann window, {text}, over the whole record; shaded: '
-                "95 % confidence. A frequency is told where the accelerations stand 9 dB above their floor; its sd and "
-                "damping are of the liveliest minutes. A raw or fused column without a number: nothing stands out of "
-                "that displacement there.</p>"
+                f'<p class="small">Welch\u2019s densities, Hann window, over the whole record ({text}); shaded: 95 % '
+                "confidence. Fixes: those that the gate took, without what it refused or used less a level, and not "
+                f"those of a start. A frequency is told where the accelerations stand {PEAK_DB:.0f} dB "
+                "above their floor and rise clearly from the valleys beside: the skirt of another peak is none; its sd "
+                "and damping are of the liveliest minutes. Beside it stands the nearest peak of the displacements, on "
+                f"any axis, {BOTTOM_DB:.0f} dB above their floor and within 3 % or 1.5 lines; \u201cno peak\u201d: "
+                "there is none, \u201ctoo fast\u201d: beyond what their rate shows, \u2013: no spectrum, for no "
+                "segment was whole.</p>"
             )
     return "".join(out)
+
+
+def _peak(freq_hz: float, found_hz: float, s: spectra.Spectrum | None) -> str:
+    """The peak of a displacement beside a frequency of the accelerations, or why there is none."""
+    if s is None:
+        return "\u2013"
+    if math.isfinite(found_hz):
+        return number(found_hz, 3)
+    return "no peak" if freq_hz < 0.9 * float(s.freq_hz[-1]) else "too fast"
 
 
 def _tracks(r: Review, name: str, p: PointFigures) -> str:
@@ -236,7 +258,8 @@ def wavelets(r: Review) -> str:
         w = p.wavelets
         if w is None:
             why = (
-                "no valid displacement" if not p.moments.n
+                "it has no receiver, so there is no displacement" if not p.receiver
+                else "no valid displacement" if not p.moments.n
                 else "it has no accelerometer" if not p.accelerometer
                 else "no frequency stands out of the accelerations" if not p.frequencies
                 else "no stretch of fixes and accelerations long enough"
@@ -267,7 +290,7 @@ def wavelets(r: Review) -> str:
             shown = [np.quantile(MM * x, (0.002, 0.998)) for x in (b.value_m, b.fixes_m) if len(x)]  # ends may be wild
             plot = Plot(frame, Scale(*limits(*shown), "mm"), 130, alone=True)
             if len(b.fixes_m):
-                plot.area(*_spans(b.fixes_t_ns, MM * b.fixes_m), math.inf, "#a9a9a9", "raw GNSS, same band")
+                plot.area(*_spans(b.fixes_t_ns, MM * b.fixes_m), math.inf, RAW, "fixes, same band")
             plot.area(*_spans(b.t_ns, MM * b.value_m), math.inf, BLUE, "fused")
             title = f"{name} {AXES[w.axis]}: {number(b.freq_hz, 3)} Hz alone, {b.low_hz:.3g} to {b.high_hz:.3g} Hz"
             out.append(plot.html(title))
@@ -283,12 +306,13 @@ def wavelets(r: Review) -> str:
             )
         if rows:
             head = [
-                "band [Hz]", "rms fused [mm]", "rms raw GNSS [mm]", "fused / raw, power", "largest fused [mm]",
+                "band [Hz]", "rms fused [mm]", "rms of the fixes [mm]", "fused / fixes, power", "largest fused [mm]",
             ]  # fmt: skip
             out.append(table(head, rows, 4))
     text = (
-        "Morlet wavelets (Torrence &amp; Compo 1998) in the liveliest minutes of each point. What the raw fixes have "
-        "beyond the fused displacement in a band is noise of the receiver. Raw GNSS without a number: fixes too rare."
+        "Morlet wavelets (Torrence &amp; Compo 1998) in the liveliest minutes of each point. What the fixes have "
+        "beyond the fused displacement in a band is noise of the receiver. Figures leave out both ends, where the "
+        "record\u2019s ends are felt. \u2013: fixes too rare for the band, or minutes too few for it."
     )
     return "".join(out) + f'<p class="small">{text}</p>'
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,9 +25,9 @@ from edge_agent.geodesy import Frame
 from edge_agent.messages import F64, I64, U8, AccelFlag, CanFrames, Config, Quality, S, Verdict
 from edge_agent.pipeline import Pipeline
 from edge_agent.recording import topics
-from edge_agent.recording.reader import DamagedError, Stored, read_messages, read_metadata
+from edge_agent.recording.reader import DamagedError, Rows, Stored, read_messages, read_metadata, read_rows
 from edge_agent.recording.writer import RUN_METADATA
-from edge_agent.replay import ReplayError, in_order, recorded_config
+from edge_agent.replay import CONFIG_NAME, ReplayError, in_order, recorded_config
 from edge_agent.review.ahead import ahead, worth
 from edge_agent.review.columns import groups
 from edge_agent.review.learned import Learned, learned
@@ -50,13 +51,11 @@ KEPT = 5000
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """The live stream of a point: utc_ns (n,), displacement, velocity and their sd (n, 3), mode, flags (n,)."""
+    """The live stream of a point: utc_ns (n,), displacement and its sd (n, 3), mode, flags (n,)."""
 
     utc_ns: I64
     displacement_m: F64
-    velocity_mps: F64
     std_displacement_m: F64
-    std_velocity_mps: F64
     mode: U8
     flags: U8
 
@@ -136,6 +135,13 @@ class Piece:
     bias: dict[str, tuple[I64, F64, F64]] = field(default_factory=dict)  # of a point: utc_ns, m/s2 and its sd (n, 3)
 
 
+class Share(NamedTuple):
+    """Names of the points and accelerometers that one of several processes looks at."""
+
+    points: frozenset[str]
+    accelerometers: frozenset[str]
+
+
 def configuration(paths: Sequence[Path]) -> Config:
     """The first configuration that is attached to a file. ReplayError where none is."""
     for path in paths:
@@ -143,7 +149,8 @@ def configuration(paths: Sequence[Path]) -> Config:
             return recorded_config(path)
         except (OSError, DamagedError, ReplayError):
             continue
-    raise ReplayError(f"no configuration in {', '.join(str(p) for p in paths) or 'nothing'}")
+    told = ", ".join(str(p) for p in paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
+    raise ReplayError(f"no {CONFIG_NAME} is attached to {told}: one of the files must hold it, as the agent writes it")
 
 
 def files_of(inputs: Sequence[Path]) -> tuple[list[Path], dict[Path, str]]:
@@ -159,14 +166,24 @@ def files_of(inputs: Sequence[Path]) -> tuple[list[Path], dict[Path, str]]:
             try:
                 if file.stat().st_size == 0:
                     bad[file] = "empty"
-                elif next(read_messages(file), None) is None:
-                    bad[file] = "holds no message"
+                elif next(read_messages(file, WANTED), None) is None:
+                    bad[file] = _strange(file)
                 else:
                     read_metadata(file)
                     good.append(file)
-            except (OSError, DamagedError) as e:
-                bad[file] = str(e)
+            except OSError as e:
+                bad[file] = e.strerror or str(e)
+            except DamagedError as e:
+                bad[file] = str(e).removeprefix(f"{file}: ")
     return (in_order(good) if good else []), bad
+
+
+def _strange(file: Path) -> str:
+    """Why a file without a topic of this program is of no use."""
+    first = next(read_messages(file), None)
+    if first is None:
+        return "holds no message"
+    return f"{STRANGE}: it holds {first.topic} and the like"
 
 
 def pieces(
@@ -183,14 +200,19 @@ def pieces(
     return map(_widened, ahead(_pieces, *args) if worth(files) else _pieces(*args))
 
 
+def pieces_of(
+    files: Sequence[Path], config: Config, own: Mapping[Path, Config], share: Share | None
+) -> Iterator[Piece]:
+    """The same by this process, with some points and accelerometers only (None: all): cut at the same places."""
+    return map(_widened, _pieces(list(files), config, bool(config.accelerometers), PIECE_S, dict(own), share))
+
+
 def _widened(piece: Piece) -> Piece:
     for name, f in piece.fused.items():
         piece.fused[name] = Fused(
             f.utc_ns,
             f.displacement_m.astype(np.float64),
-            f.velocity_mps.astype(np.float64),
             f.std_displacement_m.astype(np.float64),
-            f.std_velocity_mps.astype(np.float64),
             f.mode,
             f.flags,
         )
@@ -198,11 +220,16 @@ def _widened(piece: Piece) -> Piece:
 
 
 def _pieces(
-    files: list[Path], config: Config, accelerations: bool, piece_s: float, own: dict[Path, Config]
+    files: list[Path],
+    config: Config,
+    accelerations: bool,
+    piece_s: float,
+    own: dict[Path, Config],
+    share: Share | None = None,
 ) -> Iterator[Piece]:
     """The same with the fused stream in float32, as it is recorded: less to hand over."""
     for path in files:
-        yield from _File(path, own.get(path, config), accelerations, round(piece_s * S)).walk()
+        yield from _File(path, own.get(path, config), accelerations, round(piece_s * S), share).walk()
 
 
 def window(
@@ -244,24 +271,75 @@ def _together(rows: list[tuple[Any, ...]], count: int) -> list[Any]:
     return [np.concatenate(c) for c in zip(*rows, strict=True)]
 
 
+_FUSED, _JUDGED, _FIXES, _SINGLE, _ORDERED, _OTHERS = range(1, 7)
+"""What is done with a topic's messages: decoded many at once; taken one by one; taken one by one in order with all
+others, for they change what others mean; left to another process."""
+
+
+def _kind(topic: str) -> tuple[int, str]:
+    """That of a topic, 0 = not looked at, and the name of its point or receiver."""
+    match topic.split("/"):
+        case ["", "raw", "checkpoint"] | ["", "events"]:
+            return _ORDERED, ""
+        case ["", "raw", _] | ["", "faults"] | ["", "fusion", _, "heading"] | ["", "accel", _, "block"]:
+            return _SINGLE, ""
+        case ["", "fusion", name, "block"]:
+            return _FUSED, name
+        case ["", "fusion", name, "update"]:
+            return _JUDGED, name
+        case ["", "gnss", name, "solution"]:
+            return _FIXES, name
+    return 0, ""
+
+
+STRANGE = "no recording of edge-agent"
+"""Begins the reason for a file that is whole, but another program's."""
+
+
 class _Wanted:
     """The topics that pieces are made of."""
 
     def __contains__(self, topic: object) -> bool:
-        name = str(topic)
-        return name.startswith((topics.RAW_PREFIX, "/events", "/faults")) or name.endswith(
-            ("/block", "/update", "/solution", "/heading")
-        )
+        return _kind(str(topic))[0] != 0
 
 
 WANTED = _Wanted()
 
 
+def _fields(plain: str, threes: str) -> frozenset[str]:
+    return frozenset([*plain.split(), *(f"{name}.{axis}" for name in threes.split() for axis in "xyz")])
+
+
+_FIELDS = {
+    _FUSED: _fields(
+        "t_offset_ns mode flags "
+        "displacement_x_m displacement_y_m displacement_z_m "
+        "std_displacement_x_m std_displacement_y_m std_displacement_z_m",
+        "bias_mps2 std_bias_mps2",
+    ),
+    _JUDGED: _fields("monotonic_ns ratio verdict", "residual_m std_residual_m std_fix_m offset_m"),
+    _FIXES: _fields(
+        "monotonic_ns east_m north_m up_m course_deg speed_mps fix satellites latency_ns age_s", "std_enu_m"
+    ),
+}
+"""The fields of which rows are made."""
+
+
+class _Many:
+    """Messages of one kind that wait to be decoded together: content, whose it is, publish time [UTC ns]."""
+
+    def __init__(self) -> None:
+        self.schema = ""
+        self.data: list[bytes] = []
+        self.names: list[str] = []
+        self.publish_ns: list[int] = []
+
+
 class _File:
     """One file's walk: rows wait in lists until the piece is long enough."""
 
-    def __init__(self, path: Path, config: Config, accelerations: bool, span_ns: int) -> None:
-        self.path, self.config, self.span_ns = path, config, span_ns
+    def __init__(self, path: Path, config: Config, accelerations: bool, span_ns: int, share: Share | None) -> None:
+        self.path, self.config, self.span_ns, self.share = path, config, span_ns, share
         try:
             self.run = read_metadata(path).get(RUN_METADATA, {}).get("run", "")
         except (OSError, DamagedError):
@@ -278,11 +356,12 @@ class _File:
         self.frames_ns = FRAMES_NS[0 if counted else 1]
         self.cell = -1  # of the frames that wait
         self.first = True
+        self.kinds: dict[str, tuple[int, str]] = {}
         self._new()
 
     def _new(self) -> None:
         self.rows: dict[tuple[str, str], list[tuple[Any, ...]]] = {}
-        self.kept: dict[tuple[str, str], list[Stored]] = {}
+        self.kept = {kind: _Many() for kind in (_FUSED, _JUDGED, _FIXES)}
         self.happened: list[Happened] = []
         self.missing = 0
         self.noted: list[Stored] = []
@@ -292,44 +371,83 @@ class _File:
         damage = ""
         try:
             span = -1
-            for stored in read_messages(self.path, WANTED):
-                cell = stored.log_ns // self.frames_ns
-                if cell != self.cell:  # not where a piece ends: that must not move the clocks
-                    self._frames()
-                    self.cell = cell
-                if stored.log_ns // self.span_ns != span:
-                    if span >= 0:
-                        yield self._piece("")
-                    span = stored.log_ns // self.span_ns
-                self._take(stored)
+            for rows in read_rows(self.path):
+                kinds = {c: self._kind_of(topic) for c, (topic, _) in rows.named.items()}
+                table = np.zeros(max(kinds, default=0) + 1, np.uint8)
+                table[list(kinds)] = [kind for kind, _ in kinds.values()]
+                chosen = np.flatnonzero(table[rows.channel])
+                cells, spans = rows.log_ns[chosen] // self.frames_ns, rows.log_ns[chosen] // self.span_ns
+                cuts = np.flatnonzero((np.diff(cells) != 0) | (np.diff(spans) != 0)) + 1
+                for lo, hi in pairwise([0, *cuts.tolist(), len(chosen)]):
+                    if lo == hi:
+                        continue
+                    if cells[lo] != self.cell:  # not where a piece ends: that must not move the clocks
+                        self._frames()
+                        self.cell = int(cells[lo])
+                    if spans[lo] != span:
+                        if span >= 0:
+                            yield self._piece("")
+                        span = int(spans[lo])
+                    self._take(rows, chosen[lo:hi], table, kinds)
         except (OSError, ValueError) as e:  # what no longer decodes is damage too
             damage = str(e)
         self._frames()
         yield self._piece(damage)
 
-    def _take(self, s: Stored) -> None:
-        if s.topic == topics.CHECKPOINT_TOPIC:
-            self._checkpoint(s)
-        elif s.topic.startswith(topics.RAW_PREFIX):
+    def _kind_of(self, topic: str) -> tuple[int, str]:
+        """`_kind`, 0 for another's points."""
+        if topic not in self.kinds:
+            kind, name = _kind(topic)
+            if kind in (_FUSED, _JUDGED) and self.share is not None and name not in self.share.points:
+                kind = _OTHERS
+            self.kinds[topic] = kind, name
+        return self.kinds[topic]
+
+    def _decodes(self, accelerometer: str) -> bool:
+        return self.share is None or accelerometer in self.share.accelerometers
+
+    def _take(self, rows: Rows, k: I64, table: U8, kinds: dict[int, tuple[int, str]]) -> None:
+        """Take rows k of a chunk, in the order of the file where it matters."""
+        kind = table[rows.channel[k]]
+        for lo, hi in pairwise([0, *(np.flatnonzero(kind == _ORDERED) + 1).tolist(), len(k)]):
+            part, which = k[lo:hi], kind[lo:hi]
+            last = hi > lo and which[-1] == _ORDERED
+            for many in (_FUSED, _JUDGED, _FIXES):
+                some = part[which == many]
+                if len(some):
+                    self._keep(self.kept[many], rows, some, kinds)
+            for i in part[which == _SINGLE].tolist():
+                self._single(_stored(rows, i))
+            if last:
+                s = _stored(rows, int(part[-1]))
+                if s.topic == topics.CHECKPOINT_TOPIC:
+                    self._checkpoint(s)
+                else:
+                    self._event(s)
+
+    @staticmethod
+    def _keep(many: _Many, rows: Rows, k: I64, kinds: dict[int, tuple[int, str]]) -> None:
+        many.schema = many.schema or rows.named[int(rows.channel[k[0]])][1]
+        begin, end = rows.begin[k].tolist(), rows.end[k].tolist()
+        many.data += [rows.data[a:b] for a, b in zip(begin, end, strict=True)]
+        many.names += [kinds[c][1] for c in rows.channel[k].tolist()]
+        many.publish_ns += rows.publish_ns[k].tolist()
+
+    def _single(self, s: Stored) -> None:
+        if s.topic.startswith(topics.RAW_PREFIX):
             self._raw(s)
-        elif s.topic in ("/events", "/faults"):
+        elif s.topic == "/faults":
             self._event(s)
+        elif s.topic.startswith("/fusion/"):  # a heading
+            self.noted.append(s)
         else:
-            match s.topic.split("/"):
-                case ["", "fusion", point, "block"]:
-                    self._keep("fused", point, s)
-                case ["", "fusion", point, "update"]:
-                    self._keep("judged", point, s)
-                case ["", "gnss", receiver, "solution"]:
-                    self._keep("fixes", receiver, s)
-                case ["", "fusion", _, "heading"]:
-                    self.noted.append(s)
-                case ["", "accel", name, "block"]:
-                    b = topics.decode_accel_block(name, s.data)
-                    self.decode_raw = False  # recorded at full rate: nothing to compute again
-                    self.waiting.clear()
-                    offset = s.publish_ns - int(b.t_ns[0])
-                    self._put("accel", name, b.t_ns + offset, b.t_ns, b.xyz, b.flags)
+            name = s.topic.split("/")[2]
+            self.decode_raw = False  # recorded at full rate: nothing to compute again
+            self.waiting.clear()
+            if self._decodes(name):
+                b = topics.decode_accel_block(name, s.data)
+                offset = s.publish_ns - int(b.t_ns[0])
+                self._put("accel", name, b.t_ns + offset, b.t_ns, b.xyz, b.flags)
 
     def _checkpoint(self, s: Stored) -> None:
         point = topics.decode_checkpoint(s.data)
@@ -365,7 +483,7 @@ class _File:
         for source, wait in waiting.items():
             frames = _joined([w[0] for w in wait])
             for name, accelerometer in self.pipeline.accelerometers.items():
-                if accelerometer.settings.port != source:
+                if accelerometer.settings.port != source or not self._decodes(name):
                     continue
                 block, _ = accelerometer.codec.feed(frames)
                 if block is None or not block.t_ns.size:
@@ -374,52 +492,51 @@ class _File:
                 block = with_times(block, t_ns, t_ns is not block.t_ns, gap)
                 self._put("accel", name, block.t_ns + wait[0][1], block.t_ns, block.xyz, block.flags)
 
-    def _keep(self, kind: str, name: str, s: Stored) -> None:
-        self.kept.setdefault((kind, name), []).append(s)
-
-    def _decode(self, kind: str, name: str) -> None:
-        """Turn kept messages of one topic into rows."""
-        messages = self.kept.pop((kind, name), [])
-        if not messages:
+    def _decode(self, kind: int) -> None:
+        """Turn messages that wait into rows."""
+        many = self.kept[kind]
+        if not many.data:
             return
-        publish = np.array([m.publish_ns for m in messages], np.int64)
-        for group in groups(messages[0].schema, [m.data for m in messages]):
-            c, utc = group.columns, publish[group.rows]
-            t = c["monotonic_ns"][:, 0]
-            if kind == "fused":
-                self._put("bias", name, utc, _three(c, "bias_mps2"), _three(c, "std_bias_mps2"))
-                after = c["t_offset_ns"]
-                three = (
-                    np.stack([c[f"{what}_{axis}_{unit}"].reshape(-1) for axis in "xyz"], axis=1)
-                    for what, unit in (
-                        ("displacement", "m"),
-                        ("velocity", "mps"),
-                        ("std_displacement", "m"),
-                        ("std_velocity", "mps"),
-                    )
-                )
-                self._put(
-                    kind,
-                    name,
-                    (utc[:, None] + after).reshape(-1),
-                    *three,
-                    c["mode"].reshape(-1),
-                    c["flags"].reshape(-1),
-                )
-            elif kind == "judged":
-                three = (_three(c, k) for k in ("residual_m", "std_residual_m", "std_fix_m", "offset_m"))
-                self._put(kind, name, utc, t, *three, c["ratio"][:, 0].astype(np.float64), c["verdict"][:, 0])
-            else:
-                enu = np.stack([c[k][:, 0] for k in ("east_m", "north_m", "up_m")], axis=1)
-                z = enu @ self.turn.T - self.zero.get(name, np.zeros(3))
-                std = _three(c, "std_enu_m")
-                std = np.array([self.axes.std_to_structure((e, n, u)) for e, n, u in std.tolist()])
-                course, speed = np.radians(c["course_deg"][:, 0].astype(np.float64)), c["speed_mps"][:, 0]
-                velocity = np.stack([speed * np.sin(course), speed * np.cos(course)], axis=1) @ self.turn[:2, :2].T
-                self._put(
-                    kind, name, utc, t, z, std, c["fix"][:, 0], c["satellites"][:, 0].astype(np.int64),
-                    c["latency_ns"][:, 0] / S, c["age_s"][:, 0].astype(np.float64), velocity,
-                )  # fmt: skip
+        self.kept[kind] = _Many()
+        numbers = {name: i for i, name in enumerate(dict.fromkeys(many.names))}
+        number = np.array([numbers[n] for n in many.names], np.int64)
+        publish = np.array(many.publish_ns, np.int64)
+        names = list(numbers)
+        for group in groups(many.schema, many.data, _FIELDS[kind]):
+            order = np.argsort(number[group.rows], kind="stable")
+            whose = number[group.rows][order]
+            edges = [0, *(np.flatnonzero(np.diff(whose)) + 1).tolist(), len(whose)]
+            for lo, hi in pairwise(edges):
+                k = order[lo:hi]
+                one = {name: column[k] for name, column in group.columns.items()}
+                self._rows_of(kind, names[int(whose[lo])], publish[group.rows[k]], one)
+
+    def _rows_of(self, kind: int, name: str, utc: I64, c: dict[str, Any]) -> None:
+        """Rows of one point or receiver from the columns of its messages, published at `utc`."""
+        if kind == _FUSED:
+            self._put("bias", name, utc, _three(c, "bias_mps2"), _three(c, "std_bias_mps2"))
+            three = (
+                np.stack([c[f"{what}_{axis}_m"].reshape(-1) for axis in "xyz"], axis=1)
+                for what in ("displacement", "std_displacement")
+            )
+            times = (utc[:, None] + c["t_offset_ns"]).reshape(-1)
+            self._put("fused", name, times, *three, c["mode"].reshape(-1), c["flags"].reshape(-1))
+            return
+        t = c["monotonic_ns"][:, 0]
+        if kind == _JUDGED:
+            three = (_three(c, k) for k in ("residual_m", "std_residual_m", "std_fix_m", "offset_m"))
+            self._put("judged", name, utc, t, *three, c["ratio"][:, 0].astype(np.float64), c["verdict"][:, 0])
+            return
+        enu = np.stack([c[k][:, 0] for k in ("east_m", "north_m", "up_m")], axis=1)
+        z = enu @ self.turn.T - self.zero.get(name, np.zeros(3))
+        std = _three(c, "std_enu_m")
+        std = np.array([self.axes.std_to_structure((e, n, u)) for e, n, u in std.tolist()])
+        course, speed = np.radians(c["course_deg"][:, 0].astype(np.float64)), c["speed_mps"][:, 0]
+        velocity = np.stack([speed * np.sin(course), speed * np.cos(course)], axis=1) @ self.turn[:2, :2].T
+        self._put(
+            "fixes", name, utc, t, z, std, c["fix"][:, 0], c["satellites"][:, 0].astype(np.int64),
+            c["latency_ns"][:, 0] / S, c["age_s"][:, 0].astype(np.float64), velocity,
+        )  # fmt: skip
 
     def _event(self, s: Stored) -> None:
         d = topics.decode(s.schema, s.data)
@@ -428,15 +545,15 @@ class _File:
         fault = s.topic == "/faults"
         self.happened.append(Happened(begin, end, d["monotonic_ns"], d["kind"], d["source"], d["text"], values, fault))
         if d["kind"] == "REFERENCE" and d["source"] in self.zero and {"x_m", "y_m", "z_m"} <= values.keys():
-            self._decode("fixes", d["source"])  # those before count from the old zero
+            self._decode(_FIXES)  # those before count from the old zero
             self.zero[d["source"]] = np.array([values["x_m"], values["y_m"], values["z_m"]])
 
     def _put(self, kind: str, name: str, *columns: Any) -> None:
         self.rows.setdefault((kind, name), []).append(columns)
 
     def _piece(self, damage: str) -> Piece:
-        for kind, name in list(self.kept):
-            self._decode(kind, name)
+        for kind in self.kept:
+            self._decode(kind)
 
         def joined(kind: str) -> dict[str, list[Any]]:
             out = {}
@@ -467,6 +584,13 @@ class _File:
         self.first = False
         self._new()
         return piece
+
+
+def _stored(rows: Rows, i: int) -> Stored:
+    """A row as a message of its own; its number within its channel is not known."""
+    topic, schema = rows.named[int(rows.channel[i])]
+    data = rows.data[int(rows.begin[i]) : int(rows.end[i])]
+    return Stored(topic, schema, int(rows.log_ns[i]), int(rows.publish_ns[i]), 0, data)
 
 
 def _three(c: dict[str, Any], name: str) -> F64:
@@ -586,12 +710,10 @@ class Stream:
 
 @dataclass
 class Point:
-    """What a point did. Envelopes in m, m/s: displacement, velocity, sd of displacement; of the gate: residual,
-    ratio."""
+    """What a point did. Envelopes in m: displacement and its sd; of the gate: residual, ratio."""
 
     stream: Stream = field(default_factory=lambda: Stream())
     displacement: Envelope = field(default_factory=lambda: Envelope(3))
-    velocity: Envelope = field(default_factory=lambda: Envelope(3))
     std: Envelope = field(default_factory=lambda: Envelope(3))
     residual: Envelope = field(default_factory=lambda: Envelope(3))
     ratio: Envelope = field(default_factory=lambda: Envelope(1))
@@ -648,7 +770,6 @@ class Overview:
             p = self.points.setdefault(name, Point())
             p.stream.add(f.utc_ns)
             p.displacement.add(f.utc_ns, f.displacement_m)
-            p.velocity.add(f.utc_ns, f.velocity_mps)
             p.std.add(f.utc_ns, f.std_displacement_m)
             _count(p.modes, f.mode)
         for name, j in piece.judged.items():

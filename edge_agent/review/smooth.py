@@ -121,8 +121,9 @@ class Increments(NamedTuple):
     after: I64
 
 
-def increments(node_ns: I64, accel: Accelerations, reference: F64) -> Increments:
+def increments(node_ns: I64, accel: Accelerations, reference: F64, *, velocity: bool = True) -> Increments:
     """Integrate accelerations less `reference` (3,) between nodes (n + 1,). Without samples everything is zero.
+    `velocity`: v is wanted, else it is empty.
 
     Nodes in a gap of the accelerations stand among the samples, so that the stream has no hole where fixes are."""
     n = len(node_ns) - 1
@@ -175,7 +176,8 @@ def increments(node_ns: I64, accel: Accelerations, reference: F64) -> Increments
         once = np.ones(len(order), np.bool_)
         once[1:] = np.diff(times[order]) > 0
         times, after, where = times[order][once], after[order][once], where[order][once]
-    return Increments(s1, s2, extra, times, v[:, where], d[:, where], after)
+    after = after.astype(np.int32)
+    return Increments(s1, s2, extra, times, v[:, where] if velocity else v[:, :0], d[:, where], after)
 
 
 def _blows(t: I64, a: F64, node_ns: I64) -> F64:
@@ -537,13 +539,15 @@ def _steps(start: State, fixes: Fixes, inc: Increments, noise: Noise, L: int, K:
     return Steps(*(_lay(a, L, K, pad) for a, pad in rows))
 
 
-def _forward(start: State, fixes: Fixes, accel: Accelerations, reference: F64, noise: Noise) -> _Chapter:
+def _forward(
+    start: State, fixes: Fixes, accel: Accelerations, reference: F64, noise: Noise, velocity: bool = True
+) -> _Chapter:
     """Filter fixes that lie behind `start`."""
     n = len(fixes)
     node_ns = np.concatenate([[start.t_ns], fixes.t_ns])
     if not (np.diff(node_ns) > 0).all():
         raise ValueError("smooth: fixes must rise strictly in time")
-    inc = increments(node_ns, accel, reference)
+    inc = increments(node_ns, accel, reference, velocity=velocity)
     K = max(1, round(math.sqrt(n)))
     L = -(-n // K)
     K = -(-n // L)
@@ -619,10 +623,10 @@ def _mul(a: F64, b: F64) -> F64:
 @dataclass(frozen=True, slots=True)
 class Smooth:
     """The smoothed stream at t_ns (m,), samples of the accelerometer (fixes where there are none): displacement and
-    velocity (m, 3) in m and m/s with their sd (empty where not asked for). At the fixes fix_ns (n,): state x (n, N, 3)
-    with covariance P (n, N, N, 3), bias about `reference` (3,); log likelihood of the fixes given the model, per axis
-    (3,). open_end: the largest share of its sd by which what lies behind the interval could still move the end of
-    this part (0 = nothing lies behind)."""
+    velocity (m, 3) in m and m/s with their sd (what is not asked for is empty). At the fixes fix_ns (n,): state x
+    (n, N, 3) with covariance P (n, N, N, 3), bias about `reference` (3,); log likelihood of the fixes given the model,
+    per axis (3,). open_end: the largest share of its sd by which what lies behind the interval could still move the end
+    of this part (0 = nothing lies behind)."""
 
     t_ns: I64
     displacement_m: F64
@@ -659,29 +663,35 @@ def _finish(
     t = inc.t_ns
     tau = np.asarray((t - c.node_ns[inc.after]) * NS, dtype=np.float64)
     m = len(tau)
-    d, v = np.empty((3, m + last)), np.zeros((3, m + last))
+    speed = inc.v.shape[1] == m
+    d, v = np.empty((3, m + last)), np.zeros((3, m + last if speed else 0))
     for axis in range(3):
         for k in _cached(m):
             at, after, slope = tau[k], inc.after[k], v[axis, k]
             y = poly[-1][axis].take(after)
             for p in poly[-2::-1]:
-                slope *= at
-                slope += y
+                if speed:
+                    slope *= at
+                    slope += y
                 y *= at
                 y += p[axis].take(after)
             np.add(y, inc.d[axis, k], out=d[axis, k])
-            slope += inc.v[axis, k]
+            if speed:
+                slope += inc.v[axis, k]
     sd_d = sd_v = np.zeros((3, 0))
     if std:
         P_f, n = c.line(P0, f.P)[..., :-1], c.line(before.n, adjoint.n)[..., :-1]
         jumps = bool(c.level or c.start.level or n[O].any())
-        sd_d, sd_v = np.empty((3, m + last)), np.empty((3, m + last))
-        _spread(P_f, n, q, qb, tau, inc.after, (D, V, B, O) if jumps else (D, V, B), (sd_d, sd_v))
+        sd_d, sd_v = np.empty((3, m + last)), np.empty((3, m + last if speed else 0))
+        out = (sd_d, sd_v) if speed else (sd_d,)
+        _spread(P_f, n, q, qb, tau, inc.after, (D, V, B, O) if jumps else (D, V, B), out)
     if last:
         t = np.concatenate([t, c.node_ns[-1:]])
-        d[:, m], v[:, m] = x[D, :, -1], x[V, :, -1]
-        if std:
-            sd_d[:, m], sd_v[:, m] = (np.sqrt(np.maximum(P[i, i, :, -1], 0.0)) for i in (D, V))
+        for state, value, sd in ((D, d, sd_d), (V, v, sd_v)):
+            if state == D or speed:
+                value[:, m] = x[state, :, -1]
+                if std:
+                    sd[:, m] = np.sqrt(np.maximum(P[state, state, :, -1], 0.0))
     used = f.w > 0
     w = np.where(used, f.w, 1.0)
     each = np.where(used, np.log(w) - f.e * f.e / w - math.log(2 * math.pi), 0.0)
@@ -731,9 +741,10 @@ def _add_product(total: Poly, a: Poly, b: Poly, factor: F64) -> None:
 
 
 def _spread(
-    P: F64, n: F64, q: F64, qb: F64, tau: F64, after: I64, states: tuple[int, ...], out: tuple[F64, F64]
+    P: F64, n: F64, q: F64, qb: F64, tau: F64, after: I64, states: tuple[int, ...], out: tuple[F64, ...]
 ) -> None:
-    """sd of d and v (3, m), into `out`, between nodes: P_s(tau) = P(tau) - y N y', y = [F P + Q F(-tau)'] of its row.
+    """sd of d, or of d and v, (3, m), into `out`, between nodes: P_s(tau) = P(tau) - y N y', y = [F P + Q F(-tau)'] of
+    its row.
 
     P, n (N, N, 3, n). Terms of the variance, a polynomial of degree 10, that nowhere reach 1e-5 of it are left out."""
     rows: dict[int, Poly] = {
@@ -747,7 +758,7 @@ def _spread(
     slopes = {i: _slope(row) for i, row in rows.items()}
     longest = np.zeros(q.shape[1])
     np.maximum.at(longest, after, tau)
-    for lines, total, sd in ((rows, own, out[0]), (slopes, speed, out[1])):
+    for lines, total, sd in zip((rows, slopes), (own, speed), out, strict=False):
         for i in states:
             for j in states:
                 if j >= i:
@@ -795,8 +806,8 @@ class Smoother:
     Another run, or what lies behind an outage that nothing bridges, begins after `finish`.
     """
 
-    def __init__(self, noise: Noise, *, std: bool = True) -> None:
-        self.noise, self.std = noise, std
+    def __init__(self, noise: Noise, *, std: bool = True, velocity: bool = True) -> None:
+        self.noise, self.std, self.velocity = noise, std, velocity
         self._state: State | None = None
         self._reference: F64 = np.zeros(3)
         self._waiting: tuple[_Chapter, Alone] | None = None
@@ -809,7 +820,7 @@ class Smoother:
             fixes = fixes.part(1, len(fixes))
         if not len(fixes):
             return
-        new = _forward(self._state, fixes, accel, self._reference, self.noise)
+        new = _forward(self._state, fixes, accel, self._reference, self.noise, self.velocity)
         self._state = new.end()
         alone = _alone(new.filtered, new.steps)
         if self._waiting is not None:

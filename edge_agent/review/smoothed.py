@@ -60,14 +60,22 @@ class Smoothed:
     """Feed pieces of one point in order; each call yields blocks with their UTC - monotonic [ns]."""
 
     def __init__(
-        self, config: Config, point: str, *, noise: Noise | None = None, chapter: int = CHAPTER, block: int = BLOCK
+        self,
+        config: Config,
+        point: str,
+        *,
+        noise: Noise | None = None,
+        chapter: int = CHAPTER,
+        block: int = BLOCK,
+        velocity: bool = True,
     ) -> None:
+        """`velocity`: wanted, else the blocks' velocities and their sd are empty."""
         settings = config.points[point]
         self.point, self.receiver, self.accelerometer = point, settings.receiver, settings.accelerometer
         self.fusion = config.fusion
         # the configuration may insist on the declared variances
         self.fixed_r = 1.0 if config.fusion.r_least == config.fusion.r_most == 1.0 else None
-        self.noise, self.chapter, self.block = noise, chapter, block
+        self.noise, self.chapter, self.block, self.velocity = noise, chapter, block, velocity
         self._smoother: Smoother | None = None
         self._wait = _Waiting()
         self._r = np.ones(3)  # factor on the declared variance that belongs to the smoother's noise
@@ -191,7 +199,7 @@ class Smoothed:
         if self.noise is None:
             fixes = Fixes(fixes.t_ns, fixes.z_m, fixes.std_m * np.sqrt(self._r), fixes.level, fixes.step)
         if self._smoother is None:
-            self._smoother = Smoother(noise)
+            self._smoother = Smoother(noise, velocity=self.velocity)
         self._smoother.noise = noise
         for s in self._smoother.add(fixes, accel):
             yield from self._blocks(s)

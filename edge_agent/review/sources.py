@@ -1,4 +1,5 @@
-"""Which of the files are copies of others, and which configurations they were made with."""
+"""What a command is given: the recordings among it, of which sites they are, which are copies of others, and which
+configurations they were made with."""
 
 from __future__ import annotations
 
@@ -6,14 +7,15 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
 from edge_agent import config as configs
 from edge_agent.messages import Config
 from edge_agent.recording.reader import DamagedError, read_attachments
-from edge_agent.replay import CONFIG_NAME
+from edge_agent.replay import CONFIG_NAME, ReplayError
+from edge_agent.review.series import configuration, files_of
 from edge_agent.verify import File
 
 MOST = 100
@@ -22,6 +24,62 @@ MOST = 100
 
 ORIGIN = ("site", "source", "scenario", "seed")
 """What of a file's metadata says where its data come from; a replay keeps it."""
+
+
+class Opened(NamedTuple):
+    """Recordings in order of time, those of no use with why, the first configuration, and the different ones."""
+
+    files: list[Path]
+    bad: dict[Path, str]
+    config: Config
+    setups: list[Setup]
+
+
+def opened(inputs: Sequence[Path]) -> Opened:
+    """Look what there is. OSError for a path that is not there; ReplayError where no file holds data, or none a
+    configuration: the text names each and says what would be right."""
+    for path in inputs:
+        path.stat()
+    files, bad = files_of(inputs)
+    if not files:
+        told = [f"{p}: {why}" for p, why in sorted(bad.items())[:5]]
+        told += [f"{len(bad) - 5} more"] if len(bad) > 5 else []
+        raise ReplayError("; ".join(told) or "; ".join(_empty(p) for p in inputs))
+    return Opened(files, bad, configuration(files), setups(files))
+
+
+def _empty(folder: Path) -> str:
+    """That a folder holds no recording, and where there are some."""
+    inside = sorted(p for p in folder.iterdir() if p.is_dir())
+    below = [p for p in inside if any(".mcap" in q.suffixes for q in p.iterdir())]
+    hint = f"; there are some in {', '.join(str(p) for p in below[:3])}" if below else ""
+    return f"{folder} holds no recording (*.mcap){hint}"
+
+
+def sites(found: Opened) -> dict[str, Opened]:
+    """What was opened by site, in order of time; a file without a configuration goes with the one before it, a file of
+    no use with every site."""
+    names = {path: s.config.site for s in found.setups for path in s.files}
+    out: dict[str, list[Path]] = {}
+    site = found.config.site
+    for path in found.files:
+        site = names.get(path, site)
+        out.setdefault(site, []).append(path)
+    if len(out) < 2:
+        return {site: found}
+    parts = {}
+    for site, files in out.items():
+        own = [s for s in found.setups if s.config.site == site]
+        parts[site] = Opened(files, found.bad, own[0].config if own else found.config, own)
+    return parts
+
+
+def one_site(found: Opened) -> None:
+    """ReplayError for recordings of more than one site."""
+    parts = sites(found)
+    if len(parts) > 1:
+        told = "; ".join(f"{site}: {len(part.files)} ({part.files[0].name}, ...)" for site, part in parts.items())
+        raise ReplayError(f"the files are of {len(parts)} sites: {told}; name those of one")
 
 
 def copies(files: Sequence[File]) -> dict[Path, Path]:
@@ -62,6 +120,11 @@ class Setup:
     config: Config
     files: list[Path]
     settings: dict[str, str]
+
+    @property
+    def digest(self) -> str:
+        """What `sha256sum config.yaml` begins with."""
+        return hashlib.sha256(self.text.encode()).hexdigest()[:12]
 
 
 def setups(files: Sequence[Path]) -> list[Setup]:

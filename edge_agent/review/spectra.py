@@ -25,7 +25,10 @@ HANN_OVERLAP = 1 / 36
 MODE_GAIN = 10.0
 """Log likelihood that a resonance must add to a floor: three parameters and a search take 5 by chance."""
 BOTTOM_DB = 6.0
-"""A peak stands so far above the floor."""
+"""A peak stands so far above the floor,"""
+RISE_DB, RISE_SD = 3.0, 3.3
+"""and rises so far, and so many sd of chance, from the valley between it and what is higher: on the skirt of another
+peak nothing does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,10 +102,15 @@ def welch(
     if segment % 2 == 0:
         psd[-1] *= 0.5
     n = len(starts)
-    dof = 2.0 * n / (1.0 + 2.0 * HANN_OVERLAP * (n - 1) / n)
+    dof = freedom(n)
     z = _normal_quantile(0.5 + 0.5 * level)
     freq: F64 = np.arange(segment // 2 + 1, dtype=np.float64) * (rate_hz / segment)
     return Spectrum(freq, psd, psd * (dof / _chi2(dof, z)), psd * (dof / _chi2(dof, -z)), n, level)
+
+
+def freedom(segments: int) -> float:
+    """Degrees of freedom of the mean of half-overlapping Hann segments' densities (Welch 1967)."""
+    return 2.0 * segments / (1.0 + 2.0 * HANN_OVERLAP * (segments - 1) / segments)
 
 
 def _chi2(dof: float, z: float) -> float:
@@ -127,13 +135,33 @@ class Peak(NamedTuple):
     above_db: float
 
 
+FLOOR_ROWS = 512
+"""Lines of a floor that are found at a time."""
+
+
 def floor_of(freq_hz: F64, psd: F64, width_hz: float) -> F64:
     """Median density (k,) within +-width_hz around each frequency: what a narrow peak stands on."""
     step = float(freq_hz[1] - freq_hz[0])
     half = max(2, round(width_hz / step))
     padded = np.pad(psd, half, mode="reflect") if half < len(psd) else np.pad(psd, half, mode="edge")
     views = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
-    return np.asarray(np.median(views, axis=1))
+    floor = np.empty(len(psd))
+    for lo in range(0, len(psd), FLOOR_ROWS):  # a median copies all that it looks at
+        floor[lo : lo + FLOOR_ROWS] = np.median(views[lo : lo + FLOOR_ROWS], axis=1)
+    return floor
+
+
+def rise_db(psd: F64, at: int) -> float:
+    """How far [dB] a line stands above the valley that parts it from anything higher (its topographic prominence), inf
+    for the highest. Valleys are means of three lines: a single low one is chance."""
+    smooth = np.convolve(np.pad(psd, 1, mode="edge"), np.ones(3) / 3, mode="valid")
+    saddle = 0.0
+    for side in (np.arange(at - 1, -1, -1), np.arange(at + 1, len(psd))):
+        higher = np.flatnonzero(psd[side] > psd[at])
+        if len(higher):
+            between = side[: int(higher[0]) + 1]
+            saddle = max(saddle, float(np.minimum(smooth[between], psd[at]).min()))
+    return 10.0 * math.log10(float(psd[at]) / saddle) if saddle > 0 else math.inf
 
 
 def peaks(
@@ -144,8 +172,11 @@ def peaks(
     high_hz: float = math.inf,
     above_db: float = BOTTOM_DB,
     width_hz: float = 1.0,
+    alone: bool = True,
 ) -> list[Peak]:
-    """Peaks of a channel in [low_hz, high_hz] that stand `above_db` above the floor within +-width_hz, by frequency.
+    """Peaks of a channel in [low_hz, high_hz] that stand `above_db` above the floor within +-width_hz, by frequency;
+    `alone`: and rise from the valleys beside them by RISE_DB and RISE_SD of chance. Not asked where the peak of another
+    stream is looked for again.
 
     Of peaks nearer than a quarter of the width, the highest."""
     f, p = spectrum.freq_hz, np.maximum(spectrum.psd[:, channel], 1e-300)
@@ -155,7 +186,12 @@ def peaks(
     top = top[(above[top] >= above_db) & (f[top] >= low_hz) & (f[top] <= high_hz)]
     found: list[Peak] = []
     step = float(f[1] - f[0])
+    dof = freedom(spectrum.segments)
+    chance = 10.0 / math.log(10.0) * math.sqrt(2.0 / dof + 2.0 / (1.5 * dof))  # sd of a line over three, in dB
+    least = max(RISE_DB, RISE_SD * chance)
     for i in top[np.argsort(-db[top])].tolist():
+        if alone and rise_db(p, i) < least:
+            continue
         a, b, c = db[i - 1 : i + 2].tolist()
         at = float(f[i]) + 0.5 * (a - c) / (a - 2 * b + c) * step
         if all(abs(at - peak.freq_hz) > 0.25 * width_hz for peak in found):

@@ -28,8 +28,9 @@ from edge_agent.messages import F64, I64, Config, FusionSettings, Quality, S, Ve
 from edge_agent.replay import ReplayError, recorded_config
 from edge_agent.review.agree import Agreement, agree, turned
 from edge_agent.review.likelihood import SKIP, gains, prepare, whiten
-from edge_agent.review.series import Piece, configuration, files_of, pieces
+from edge_agent.review.series import Piece, pieces
 from edge_agent.review.smooth import NO_ACCELERATIONS, NS, Accelerations, Fixes, increments, plain
+from edge_agent.review.sources import one_site, opened
 
 STRETCH_S = (60.0, 600.0)
 """A stretch is at least so long, longer where fixes are rare,"""
@@ -456,13 +457,9 @@ def tune(inputs: Sequence[Path], progress: Callable[[str], None] | None = None) 
         if progress is not None:
             progress(text)
 
-    for path in inputs:
-        path.stat()
-    files, bad = files_of(inputs)
-    if not files:
-        told = "; ".join(f"{p}: {why}" for p, why in sorted(bad.items())) or "no recording there"
-        raise ReplayError(told)
-    config = configuration(files)
+    found = opened(inputs)
+    one_site(found)
+    files, bad, config, _ = found
     out = Tuning(files, config)
     out.notes += [f"{p.name} is left out: {why}" for p, why in sorted(bad.items())]
     keepers = {
@@ -790,15 +787,16 @@ def _gain(g: Gain | None) -> dict[str, Any] | None:
 
 
 def as_json(t: Tuning) -> dict[str, Any]:
-    """Everything, as plain values; three axes each, SI units; sd of q, qb, r are of their natural logarithms."""
+    """Everything, as plain values; three axes each, SI units; sd of q, qb, r are of their natural logarithms. What the
+    data do not tell is null."""
     return {
         "files": [str(p) for p in t.files],
         "points": {
             name: {
                 "stretches_fitted_judged": list(f.stretches),
                 "fixes_fitted_judged": list(f.fixes),
-                "accel_noise_m2ps3": _list(f.noise.q),
-                "bias_walk_m2ps5": _list(f.noise.qb),
+                "accel_noise_m2ps3": _list(np.where(np.isfinite(f.spread[0]), f.noise.q, np.nan)),
+                "bias_walk_m2ps5": _list(np.where(np.isfinite(f.spread[1]), f.noise.qb, np.nan)),
                 "r": _list(f.noise.r),
                 "std_log": {k: _list(f.spread[i], 4) for i, k in enumerate(("accel_noise", "bias_walk", "r"))},
                 "fix_std_m": _list(f.std_m),
@@ -836,7 +834,7 @@ def as_text(t: Tuning) -> str:
         )
         for i, axis in enumerate(AXES):
             told = [
-                f"{label} {v[i]:.3g} {unit}" + (f" x/: {math.exp(sd):.2f}" if sd < 3 else " (not to be found)")
+                f"{label} {v[i]:.3g} {unit} x/: {math.exp(sd):.2f}" if sd < 3 else f"{label} not to be found"
                 for label, v, unit, sd in (
                     ("q", f.noise.q, "m2/s3", f.spread[0, i]),
                     ("qb", f.noise.qb, "m2/s5", f.spread[1, i]),

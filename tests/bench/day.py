@@ -1,14 +1,17 @@
-"""A day of the bench's bridge as the agent would have recorded it: `python tests/bench/day.py FOLDER [HOURS]`.
+"""A day of the bench's bridge as the agent would have recorded it: `python tests/bench/day.py FOLDER [HOURS [FROM]]`.
 
 8 triaxial accelerometers at 250 Hz on one bus, a receiver at 10 Hz with outliers, lost fixes and float spells, through
 the agent's own pipeline and recorder with default settings: rotating files with a chain, checkpoints and diagnostics
 once a second. One motion without a seam: modes whose strength follows the day, the sun's slow drift, noise that never
-repeats. It is made minute by minute, so memory is that of a minute; an hour takes two to three minutes of a core.
+repeats. It is made minute by minute, so memory is that of a minute; an hour takes a minute and a half of a core.
+
+`whole_day` makes both halves side by side: two runs of the agent of one boot, stopped and started again at noon.
 """
 
 from __future__ import annotations
 
 import math
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -62,14 +65,14 @@ def scenario() -> Scenario:
     return Scenario("day", _BRIDGE, Gnss(latency_s=0.05, jitter_s=0.005), accels)
 
 
-def raws(seed: int, seconds: int) -> Iterator[Raw]:
-    """What the ports would have read; `seconds` is a multiple of WINDOW_S."""
-    made, motion, rng = scenario(), DayMotion(seed), stream(seed, "noise")
+def raws(seed: int, begin: int, seconds: int) -> Iterator[Raw]:
+    """What the ports would have read from second `begin` on; both are multiples of WINDOW_S."""
+    made, motion, rng = scenario(), DayMotion(seed), stream(seed, f"noise {begin}")
     offset = EPOCH_UTC_NS - START_NS
     bias = stream(seed, "bias").uniform(-0.03, 0.03, (POINTS, 3))
     left: CanFrames | None = None
     order = 0
-    for begin_s in range(0, seconds, WINDOW_S):
+    for begin_s in range(begin, begin + seconds, WINDOW_S):
         record = _window(made, motion, rng, bias, begin_s, offset)
         end_ns = START_NS + (begin_s + WINDOW_S) * S
         frames = can_frames(record)
@@ -138,8 +141,25 @@ def _blocks(f: CanFrames, end_ns: int, block_ms: int = 100) -> tuple[list[tuple[
     return found, _part(f, slice(whole, None))
 
 
-def record(folder: Path, seconds: int, seed: int = 1) -> Path:
-    """Record a multiple of WINDOW_S into `folder` as the agent does; return the folder of the recordings."""
+def whole_day(folder: Path, hours: float = 24.0) -> Path:
+    """Record so many hours by two processes; return the folder of the recordings."""
+    half = 0.5 * hours
+    places = folder / "first", folder / "second"
+    parts = ((places[0], half, 0.0), (places[1], half, half))
+    command = [sys.executable, str(Path(__file__).resolve())]
+    made = [subprocess.Popen([*command, str(place), str(long), str(begin)]) for place, long, begin in parts]
+    codes = [p.wait() for p in made]
+    if any(codes):
+        raise RuntimeError("the day could not be recorded")
+    recordings = places[0] / "recordings"
+    for path in sorted((places[1] / "recordings").glob("*.mcap")):
+        path.rename(recordings / path.name)
+    return recordings
+
+
+def record(folder: Path, seconds: int, begin: int = 0, seed: int = 1) -> Path:
+    """Record multiples of WINDOW_S, from second `begin` on, into `folder` as the agent does; return the folder of the
+    recordings."""
     folder.mkdir(parents=True, exist_ok=True)
     made = scenario()
     (folder / "accelerometers.dbc").write_text(dbc_text(made))
@@ -153,7 +173,7 @@ def record(folder: Path, seconds: int, seed: int = 1) -> Path:
         place,
         replace(settings.record, fsync_s=1e9),
         settings.site,
-        {"run": "bench", "boot": "simulated"},
+        {"run": f"bench-{begin}", "boot": "simulated"},
         attachments,
         lambda: 1 << 50,
     )
@@ -162,7 +182,7 @@ def record(folder: Path, seconds: int, seed: int = 1) -> Path:
         topics.Status(0, f"port/{name}", "OK", {f"counter_{i}": str(10**6 + i) for i in range(8)})
         for name in (CAN_PORT, GNSS_PORT, CLOCK_PORT)
     ]
-    for raw in raws(seed, seconds):
+    for raw in raws(seed, begin, seconds):
         now = path.to_utc(raw.t_ns) // (settings.record.rotate_s * S)
         reason = "" if period >= 0 else "start"
         if isinstance(raw.payload, Tick) and not reason:
@@ -188,4 +208,5 @@ def record(folder: Path, seconds: int, seed: int = 1) -> Path:
 
 
 if __name__ == "__main__":
-    record(Path(sys.argv[1]), round(float(sys.argv[2] if len(sys.argv) > 2 else "24") * 3600))
+    hours, first = (float(sys.argv[i]) if len(sys.argv) > i else value for i, value in ((2, 24.0), (3, 0.0)))
+    record(Path(sys.argv[1]), round(hours * 3600), round(first * 3600))

@@ -250,26 +250,31 @@ def measure_live(bench: Bench, name: str, rounds: int) -> list[Result]:
     return found
 
 
-def measure_review(bench: Bench, day: bool) -> list[Result]:
+def measure_review(bench: Bench, day: str | None) -> list[Result]:
     """A day of 8 sensors at 250 Hz and 10 Hz fixes, reviewed: minutes by the clock and of processors, memory. `day`:
-    that day itself, an hour in the making; else from two short records."""
+    that day itself, in this folder ("": recorded first, in two halves side by side, half an hour on two cores); None:
+    from two short records."""
     import day as days
 
-    def run(seconds: int) -> dict[str, float]:
-        place = bench.folder / f"review-{seconds}"
-        say(f"review: recording {seconds / 3600:.2f} h")
-        folder = days.record(place, seconds)
-        say(f"review: reading {seconds / 3600:.2f} h")
-        return whole_agent.figures_of(["review", "-", str(folder), str(place / "report.html")], bench.env, 7200)
+    def review(folder: Path) -> dict[str, float]:
+        say(f"review: reading {sum(1 for _ in folder.iterdir())} files")
+        out = bench.folder / "report.html"
+        return whole_agent.figures_of(["review", "-", str(folder), str(out)], bench.env, 7200)
 
-    if day:
-        found = run(DAY_S)
+    def run(seconds: int) -> dict[str, float]:
+        say(f"review: recording {seconds / 3600:.2f} h")
+        return review(days.record(bench.folder / f"review-{seconds}", seconds))
+
+    if day is not None:
+        if not day:
+            say("review: recording 24 h")
+        found = review(Path(day) if day else days.whole_day(bench.folder / "day"))
         wall, cpu = found["wall"], found["cpu"]
     else:
         short, found = run(SHORT_S), run(LONG_S)
         more = (DAY_S - LONG_S) / (LONG_S - SHORT_S)
         wall, cpu = (found[k] + more * (found[k] - short[k]) for k in ("wall", "cpu"))
-    how = "" if day else ", by two short ones"
+    how = ", by two short ones" if day is None else ""
     return [
         Result(f"review of a day{how}", "min", (Goal(10.0),), [wall / 60]),
         Result(f"review of a day, CPU{how}", "min", (), [cpu / 60]),
@@ -286,7 +291,7 @@ def chosen(text: str) -> list[str]:
     return [n for n in NAMES if not wanted or n in wanted or n.split("-")[0] in wanted]
 
 
-def this(bench: Bench, names: Sequence[str], rounds: int, day: bool = False) -> tuple[list[Result], list[str]]:
+def this(bench: Bench, names: Sequence[str], rounds: int, day: str | None = None) -> tuple[list[Result], list[str]]:
     """Every chosen row: results, and the rows that failed with their reason."""
     results: list[Result] = []
     failed: list[str] = []
@@ -361,7 +366,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rows", default="", help=f"comma-separated: {', '.join(NAMES)}")
     parser.add_argument("--rounds", type=int, default=3, help="runs of each figure, at least 1 (default 3)")
     parser.add_argument("--compare", metavar="COMMIT", help="measure this commit's code in turn with the present one")
-    parser.add_argument("--day", action="store_true", help="review: a whole day, recorded first; an hour or two")
+    parser.add_argument(
+        "--day",
+        nargs="?",
+        const="",
+        metavar="FOLDER",
+        help="review: a whole day, that of this folder, or recorded first (half an hour on two cores)",
+    )
     parser.add_argument("--json", action="store_true", help="results as JSON")
     parser.add_argument("--strict", action="store_true", help="exit code 1 when a goal is missed")
     args = parser.parse_args(arguments)

@@ -29,7 +29,7 @@ import numpy as np
 import drivers
 from drivers import PortError
 from edge_agent import assemble, config
-from edge_agent.memory import steady_memory
+from edge_agent.memory import grow_names, steady_memory
 from edge_agent.messages import CanFrames, PortSettings, S, Tick
 from edge_agent.reading import HUNG_S
 from edge_agent.recording.segments import Recorder
@@ -309,6 +309,7 @@ def soak(wall_s: float, simulated_s: int, folder: Path) -> list[str]:
 
 def main(argv: list[str]) -> int:
     steady_memory()
+    grow_names()
     minutes, days = (float(x) for x in (*argv, *("120", "30")[len(argv) :]))
     shm = Path("/dev/shm")  # fsync is not what is tried here
     with tempfile.TemporaryDirectory(dir=shm if shm.is_dir() else None) as name:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ import pytest
 from edge_agent.__main__ import main
 from edge_agent.review import ahead, gather, series
 from edge_agent.review.ahead import ahead as run
+from edge_agent.review.figures import as_json
 from edge_agent.simulate import SCENARIOS
 from edge_agent.simulate import run as simulate
 from edge_agent.simulate.files import write_files
@@ -97,3 +100,28 @@ def test_a_review_by_two_processes_is_that_by_one(recording: Path, monkeypatch: 
     assert [path for path, _ in told[0][0]] == [spoilt]
     assert str(told[0][:-1]) == str(told[1][:-1])
     assert told[0][-1] == told[1][-1]
+
+
+def test_half_of_the_points_by_another_process_gives_the_same_review(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rough = SCENARIOS["rough"]
+    write_files(
+        simulate(replace(rough, accels=tuple(replace(rough.accels[0], name=f"a{i}") for i in range(3))), 4, 80.0),
+        tmp_path,
+    )
+    fused = str(tmp_path / "fused.mcap")
+    assert main(["replay", str(tmp_path / "raw.mcap"), "-c", str(tmp_path / "config.yaml"), "-o", fused]) == 0
+    told = []
+    for both in (False, True):
+        monkeypatch.setattr(gather, "worth", lambda files, both=both: both)
+        r = gather.gather([Path(fused)])
+        names = [list(table) for table, _ in gather._tables(r)]
+        told.append((json.dumps(as_json(r), sort_keys=True), names, r.overview.kinds, str(r.modal and r.modal.names)))
+        held = [e.spans() for p in r.overview.points.values() for e in (p.displacement, p.std, p.residual, p.ratio)]
+        held += [a.xyz.spans() for a in r.overview.accelerometers.values()]
+        held += [p.smoothed.spans() for p in r.points.values()]
+        told[-1] += (b"".join(np.asarray(a).tobytes() for e in held for a in e),)
+        assert len(r.points) == 3
+        assert all(p.busy is not None and p.agreement is not None for p in r.points.values())
+    assert told[0] == told[1]

@@ -73,7 +73,11 @@ def test_every_figure_is_that_of_the_two_recordings(
         times = [r[next(iter(r))] for r in rows]
         moved[side] = {t: (a, b) for t, a, b, v in zip(times, d, sd, valid, strict=True) if v}
         assert point[side]["samples"] == len(rows)
-        assert point[side]["valid"] == pytest.approx(valid.mean(), rel=1e-5)
+        at = np.array([t[:26] for t in times], "datetime64[us]").astype(np.int64) / 1e6
+        steps = np.diff(at[valid])  # of the time from the first fix to the last sample
+        fixes = column(folder / name, "/gnss/rover/solution", capsys)
+        begin = np.array([r[next(iter(r))][:26] for r in fixes], "datetime64[us]").astype(np.int64).min() / 1e6
+        assert point[side]["availability"] == pytest.approx(steps[steps < 1].sum() / (at[-1] - begin), rel=1e-3)
         rows = column(folder / name, "/fusion/deck/update", capsys)
         verdict = [r["verdict"] for r in rows]
         e = numbers(rows, "residual_x", "residual_y", "residual_z")

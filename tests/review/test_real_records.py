@@ -88,6 +88,12 @@ def test_the_earthquake_as_labelled_is_reported_as_a_contradiction_first(
     html = (tmp_path / "report.html").read_text()
     trouble = html[html.index("What went wrong") :]
     assert trouble.index(first[:60]) == trouble.index("<li") + len('<li class="doubt">')
+    cards = html[html.index('<div class="cards">') : html.index('<section id="summary">')]
+    assert "in doubt: the sensors contradict each other" in cards  # no peak to peak that looks like a result
+    section = html.split('<section id="agreement">')[1].split("</section>")[0]
+    assert "contradict each other" in section
+    assert "contradiction" in section
+    assert not any("same motion" in c for c in found["conclusions"])
 
 
 def test_the_shaker_has_its_modes_and_is_smoothed_to_a_tenth_of_a_millimetre(
@@ -129,7 +135,7 @@ def test_the_test_bridge_shows_its_peaks(shared_data: Path, tmp_path: Path, caps
     for freq_hz, within in ((10.79, 0.1), (13.60, 0.15), (16.26, 0.1)):
         assert near(frequencies, freq_hz) == pytest.approx(freq_hz, abs=within)
     assert all(f["axes"] == "z" for f in frequencies)  # the other two are nothing
-    assert any("vibration only" in c for c in found["conclusions"])
+    assert any("accelerometer only: vibration" in c for c in found["conclusions"])
 
 
 def test_a_turning_car_has_a_clock_and_no_fixed_yaw(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import math
 import re
+from dataclasses import replace
 from datetime import datetime
 from html.parser import HTMLParser
+from importlib.metadata import version
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -216,6 +219,7 @@ def test_every_axis_has_a_unit(html: str) -> None:
                 "ppm",
                 "order",
                 "times as often",
+                "%",
             )
             assert figure.split('class="yt">')[1].split("</div>")[0].count("<span") >= 2
         assert figure.split('class="xt">')[1].count("<span") >= 2
@@ -233,6 +237,143 @@ def test_the_page_shows_the_numbers_of_the_twin(
     whole = "".join(text.text)
     for sentence in [*twin["conclusions"], *twin["findings"]]:
         assert sentence in whole
+
+
+def test_what_is_missing_is_told_once_and_the_same_everywhere(
+    recording: Path, gathered: Review, html: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The scenario leaves out a tenth of the epochs and single samples."""
+    fixes = column(recording, "/gnss/rover/solution", capsys)
+    t = np.array([utc_ns(r[next(iter(r))]) for r in fixes])
+    due = int(round((t[-1] - t[0]) / S * 10)) + 1
+    places = int((np.round(np.diff(t) / (S // 10)) > 1).sum())
+    said = as_json(gathered)
+    epochs, samples = said["receivers"]["rover"]["epochs"], said["accelerometers"]["acc"]["due"]
+    lost = due - len(fixes)
+    assert lost > 30
+    assert (epochs["expected"], epochs["received"], epochs["missing"], epochs["gaps"]) == (
+        due,
+        len(fixes),
+        lost,
+        places,
+    )
+    assert sum(epochs["missing_by_reason"].values()) == lost
+    assert samples["gaps"] == said["accelerometers"]["acc"]["flags"]["GAP_BEFORE"] > 3
+    assert samples["expected"] == samples["received"] + samples["missing"]
+    text = parse(html)
+    for name, what, d in (("rover", "epochs", epochs), ("acc", "samples", samples)):
+        at = text.cells.index(f"{name}: {what}")
+        assert text.cells[at + 1 : at + 3] == [str(d["expected"]), str(d["received"])]
+        assert text.cells[at + 3].startswith(f"{d['missing']} (")
+        assert text.cells[at + 4] == str(d["gaps"])
+        told = f"{name}: {d['received']} of {d['expected']} {what}, {d['missing']} missing ("
+        assert any(line.startswith(told) for line in said["findings"])
+    health = parse(html.split('<section id="sensors">')[1].split("</section>")[0]).cells
+    assert health[:2] == ["acc", str(samples["received"])]
+    assert health[3:5] == [f"{samples['missing']} of {samples['expected']}", str(samples["gaps"])]
+    assert not any("gap before" in cell for cell in health)
+
+
+def test_every_event_and_flag_has_a_strip_with_its_name(gathered: Review, html: str) -> None:
+    strips = [text.strip() for text in re.findall(r'<i style="--c:#\w{6}"></i>([^<]*)', html)]
+    kinds = {f"{k.lower().replace('_', ' ')}, {source}" for k, source in gathered.received.events}
+    assert {"samples lost, acc", "start, deck"} <= kinds
+    assert kinds <= set(strips)
+    assert {"rejected", "start"} <= set(strips)
+    assert "flag: gap before" in strips
+    assert "fused" in strips
+
+
+def test_a_point_without_a_receiver_is_told_by_its_vibration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_files(run(SCENARIOS["clean"], 2, 45.0), tmp_path)
+    config = tmp_path / "config.yaml"
+    text = config.read_text()
+    assert "deck: {receiver: rover, accelerometer: acc}" in text
+    config.write_text(text.replace("deck: {receiver: rover, accelerometer: acc}", "pier: {accelerometer: acc}"))
+    fused = tmp_path / "only" / "fused.mcap"
+    fused.parent.mkdir()
+    assert main(["replay", str(tmp_path / "raw.mcap"), "-c", str(config), "-o", str(fused)]) == 0
+    r = gather([fused])
+    told = page(r)
+    assert "accelerometer only" in told
+    assert "no valid displacement" not in told
+    truth = np.genfromtxt(tmp_path / "truth.csv", delimiter=",", names=True)
+    for axis, name in enumerate(("east", "north", "up")):
+        rms = truth[f"acceleration_{name}_mps2"].std()
+        assert as_json(r)["accelerometers"]["acc"]["rms_mps2"][axis] == pytest.approx(rms, rel=0.05)
+    assert r.points["pier"].frequencies
+    cards = re.findall(r"<div><span>([^<]*)</span><b>([^<]*)</b>", told)
+    assert dict(cards)["pier: accelerometer only"].count(" / ") == 2
+
+
+def test_files_of_two_sites_get_a_page_each(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("edge_agent.review.gather._questions", lambda p: None)
+    other = tmp_path / "other"
+    write_files(run(SCENARIOS["P2"], 1, 30.0), other)
+    out = tmp_path / "report.html"
+    capsys.readouterr()
+    assert main(["review", str(recording), str(other), "-o", str(out), "--json"]) == 1
+    said = capsys.readouterr()
+    assert set(json.loads(said.out)["sites"]) == {"simulated-rough", "simulated-P2"}
+    assert "the files are of 2 sites, each has its own page: simulated-" in said.err
+    assert not out.exists()
+    assert "deck" in (tmp_path / "report-simulated-rough.html").read_text()
+    page_of_other = (tmp_path / "report-simulated-P2.html").read_text()
+    assert "<h1>simulated-P2</h1>" in page_of_other
+    assert "acc: samples" not in page_of_other
+    for command in (["tune"], ["layouts", "-o", str(tmp_path / "l")], ["replay", "-o", str(tmp_path / "o.mcap")]):
+        assert main([command[0], str(recording), str(other / "raw.mcap"), *command[1:]]) == 2
+        assert "of 2 sites" in capsys.readouterr().err
+    assert not (tmp_path / "o.mcap").exists()
+
+
+def test_a_file_of_another_program_is_left_out_and_said(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mcap.writer import Writer
+
+    monkeypatch.setattr("edge_agent.review.gather._questions", lambda p: None)
+    strange = tmp_path / "strange.mcap"
+    with strange.open("wb") as file:
+        writer = Writer(file)
+        writer.start("x", "y")
+        channel = writer.register_channel("/camera", "json", writer.register_schema("a/B", "jsonschema", b"{}"))
+        writer.add_message(channel, 1_700_000_000 * S, b"{}", 1_700_000_000 * S)
+        writer.finish()
+    r = gather([recording, strange])
+    assert r.damaged == {}
+    assert r.begin_ns > 1_780_000_000 * S
+    assert any("strange.mcap is left out: no recording of edge-agent" in text for text in as_json(r)["findings"])
+
+
+def test_a_structure_that_moved_away_is_named_first(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same names, another place."""
+    monkeypatch.setattr("edge_agent.review.gather._questions", lambda p: None)
+    scenario = SCENARIOS["rough"]
+    lat, lon, h = scenario.reference_llh
+    write_files(
+        run(replace(scenario, reference_llh=(lat + 0.1, lon, h)), 5, 20.0, (1_780_300_800 + 3600) * S), tmp_path
+    )
+    fused = tmp_path / "fused.mcap"
+    assert main(["replay", str(tmp_path / "raw.mcap"), "-o", str(fused)]) == 0
+    said = as_json(gather([recording, fused]))
+    assert said["findings"][0].startswith("rover stands 11.1 km from where it stands in other files")
+
+
+def test_the_title_block_tells_site_period_software_and_settings(recording: Path, html: str) -> None:
+    block = html.split('<dl class="plate">')[1].split("</dl>")[0]
+    config = (recording.parent / "config.yaml").read_bytes()
+    told = dict(re.findall(r"<dt>([^<]*)</dt><dd>([^<]*)</dd>", block))
+    assert told["Site"] == "simulated-rough"
+    assert told["Period"] == "2026-06-01 08:00:00 to 2026-06-01 08:01:15 UTC"
+    assert told["Settings (SHA-256 of config.yaml)"] == hashlib.sha256(config).hexdigest()[:12]
+    assert told["Reviewed by"] == f"edge-agent {version('edge-agent')}"
 
 
 def test_damaged_files_are_named_and_the_rest_is_told(
@@ -350,7 +491,7 @@ def test_a_logarithmic_axis_has_round_numbers_that_do_not_crowd() -> None:
 def piece(t: npt.NDArray[np.int64], d: F64, mode: npt.NDArray[np.uint8]) -> Piece:
     """Fused samples of a point, and nothing else."""
     sd = np.full((len(t), 3), 0.001) + np.arange(len(t))[:, None] * 1e-9
-    fused = Fused(t, d, d, sd, sd, mode, np.zeros(len(t), np.uint8))
+    fused = Fused(t, d, sd, mode, np.zeros(len(t), np.uint8))
     return Piece(Path("x.mcap"), "run", False, {"deck": fused}, {}, {}, {}, [])
 
 

@@ -19,6 +19,7 @@ from edge_agent.review.spectra import (
     band,
     fit_mode,
     peaks,
+    rise_db,
     scalogram,
     track,
     uniform,
@@ -107,6 +108,30 @@ def test_no_mode_is_found_in_noise() -> None:
     found = [fit_mode(rng.standard_normal(8000), 20.0, 3.0, 0.5) for _ in range(20)]
     assert sum(math.isfinite(m.freq_hz) for m in found) <= 1
     assert math.isnan(fit_mode(rng.standard_normal(40), 20.0, 3.0, 0.5).freq_hz)
+
+
+def test_skirts_are_no_peaks() -> None:
+    """A mode with a broad skirt, nine segments: chance makes lines on the skirt stand far above the median around, but
+    none rises from a valley, wherever the band begins. Two modes side by side are two."""
+    skirts = 0
+    for seed in range(8):
+        x = oscillator(1.7, 0.01, 100.0, 300.0, seed)
+        noise = 1e-6 * np.random.default_rng(seed).standard_normal(len(x) - 2)
+        s = welch(np.diff(x, 2) + noise, 100.0, 6000)
+        found = peaks(s, low_hz=0.5, high_hz=6.0, above_db=9.0, width_hz=2.0)
+        assert [round(p.freq_hz, 1) for p in found] == [1.7]
+        assert not peaks(s, low_hz=1.8, high_hz=6.0, above_db=9.0, width_hz=2.0)
+        skirts += bool(peaks(s, low_hz=1.8, high_hz=6.0, above_db=9.0, width_hz=2.0, alone=False))
+    assert skirts > 5  # without the rule they are told
+    x = oscillator(0.34, 0.005, 20.0, 900.0, 1) + oscillator(0.44, 0.005, 20.0, 900.0, 2)
+    found = peaks(welch(x, 20.0, 2000), low_hz=0.2, high_hz=2.0, width_hz=0.4)
+    assert [round(p.freq_hz, 2) for p in found] == [0.34, 0.44]
+
+
+def test_the_rise_of_a_line_is_from_the_higher_valley() -> None:
+    psd = np.array([1.0, 1, 1, 100, 10, 10, 10, 40, 1, 1, 1, 1])
+    assert rise_db(psd, 7) == pytest.approx(10 * math.log10(40 / 10), abs=0.01)
+    assert rise_db(psd, 3) == math.inf
 
 
 def test_a_moving_mode_is_tracked() -> None:
