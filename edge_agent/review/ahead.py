@@ -24,7 +24,7 @@ WORTH_BYTES = 48 << 20
 """Recordings that are smaller are read sooner than a process has started."""
 
 
-LARGE_BYTES = 512 << 10
+LARGE_BYTES = 1 << 20
 """Arrays of this size are given back at once, smaller ones are kept for the next: giving back has its price."""
 
 allowed = False

@@ -48,8 +48,8 @@ GAP_MEAN_S = 10.0
 """Across a gap the mean of the last accelerations of so long is held."""
 PART = 1 << 13
 """Samples between fixes that are computed at a time: what a processor's cache holds."""
-CHAPTER = 4_500
-"""Fixes of a chapter: seven minutes at 10 Hz, some 15 MB with accelerations at 250 Hz."""
+CHAPTER = 3_000
+"""Fixes of a chapter: five minutes at 10 Hz, some 10 MB with accelerations at 250 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
