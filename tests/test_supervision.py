@@ -484,15 +484,18 @@ def test_a_reader_that_was_to_open_its_port_again_and_hung_says_nothing_to_the_d
         def close(self, silently: bool = False) -> None:
             self.call("silent close" if silently else "close")
 
+        def let_go(self) -> None:
+            calls.append("let go")
+
     reader = reading.Reader(CAN, Port(), ByteQueue(1000), reading.Account(), stop, time)
     reader.run()
     assert reader.abandoned
     assert (
         calls
         == {
-            "open": ["open", "silent close after"],
-            "read": ["open", "read", "silent close after"],
-            "close": ["open", "read", "close", "silent close after"],
+            "open": ["open", "let go", "silent close after"],
+            "read": ["open", "read", "let go", "silent close after"],
+            "close": ["open", "read", "close", "let go", "silent close after"],
         }[hangs_in]
     )
     assert reader.failure is None

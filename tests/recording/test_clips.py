@@ -351,6 +351,9 @@ def test_an_event_that_a_kill_cut_short_gets_its_clip_at_the_next_start(tmp_path
     again = next_start(tmp_path, run="r3")
     assert len(files(again)) == 2
     assert list(again.faults) == []
+    second.unlink()  # the first one is there; that does not count for the second
+    next_start(tmp_path, run="r4")
+    assert [texts(path) for path in files(c)] == [list(range(105, 138)), list(range(180, 200))]
 
 
 def test_a_clip_that_was_written_before_the_kill_is_not_made_again(tmp_path: Path) -> None:
